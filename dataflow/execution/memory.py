@@ -5,6 +5,8 @@ Its arrays are read-only, but libraries need not look at that (LAPACK with `over
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 from dataflow.messages.base import Message
 from dataflow.sync import Firing
 from dataflow.sync.entries import entries_of
@@ -15,32 +17,59 @@ _KEPT = 16
 """Messages that were given before, and are watched on: an operator may keep them."""
 
 
+@dataclass(slots=True)
+class _Given:
+    """A message that operators were given: by operator the input and the stamp of the first firing that had it; its
+    digest; who has written into it, if anyone."""
+
+    message: Message
+    digest: bytes
+    to: dict[str, tuple[str, int]] = field(default_factory=dict)
+    writer: str = ""
+
+
 class MemoryGuard:
     """Compares what calls are given before and after. `keeping`: also the last messages that calls before were given,
     to that operator or another one that shares the guard."""
 
     def __init__(self, *, keeping: bool = False) -> None:
         self.keeping = keeping
-        self._taken: dict[int, tuple[dict[str, str], Message, bytes]] = {}
+        self.reached: dict[str, tuple[str, int]] = {}
+        """Operators that were given a message into which another one wrote, before or after: that other operator, and
+        the stamp of the first firing with such a message."""
+        self._given: dict[int, _Given] = {}
 
     def take(self, operator: str, firing: Firing) -> None:
         """To be called before a call, with what it is given."""
-        self._taken = dict(list(self._taken.items())[-_KEPT:]) if self.keeping else {}
+        self._given = dict(list(self._given.items())[-_KEPT:]) if self.keeping else {}
         for name, given in firing.inputs.items():
             for entry in entries_of(given):
                 message: Message = entry.value
-                if id(message) not in self._taken:
-                    self._taken[id(message)] = {}, message, message.compute_digest()
-                self._taken[id(message)][0].setdefault(operator, name)
+                known = self._given.pop(id(message), None) or _Given(message, message.compute_digest())
+                self._given[id(message)] = known
+                known.to.setdefault(operator, (name, firing.stamp))
+                self._reach(known)
 
     def changed(self, operator: str) -> str:
         """To be called after the call: the first message whose memory is not what it was, in words, or nothing."""
-        found = [key for key, (_, message, digest) in self._taken.items() if message.compute_digest() != digest]
-        said = [self._words(operator, *self._taken.pop(key)) for key in found]
-        return said[0] if said else ""
+        said = ""
+        for known in self._given.values():
+            if (digest := known.message.compute_digest()) != known.digest:
+                known.digest, known.writer = digest, operator
+                self._reach(known)
+                said = said or _words(operator, known)
+        return said
 
-    def _words(self, operator: str, names: dict[str, str], message: Message, _: bytes) -> str:
-        """`names`: of the inputs by which operators were given the message, the first of them first."""
-        owner = operator if operator in names else next(iter(names))
-        whose = f"its input {names[owner]!r}" if owner == operator else f"the input {names[owner]!r} of {owner}"
-        return f"{whose} ({message.SCHEMA} at stamp {message.stamp})"
+    def _reach(self, known: _Given) -> None:
+        if known.writer:
+            for name in known.to.keys() - {known.writer}:
+                at = known.to[name][1]
+                if at < self.reached.get(name, ("", at + 1))[1]:
+                    self.reached[name] = known.writer, at
+
+
+def _words(operator: str, known: _Given) -> str:
+    owner = operator if operator in known.to else next(iter(known.to))
+    name = known.to[owner][0]
+    whose = f"its input {name!r}" if owner == operator else f"the input {name!r} of {owner}"
+    return f"{whose} ({known.message.SCHEMA} at stamp {known.message.stamp})"

@@ -92,6 +92,11 @@ class RecordedRunner(Runner):
         """Returns what re-execution has come to so far."""
         return self.judge.result
 
+    @property
+    def next_record(self) -> FiringRecord | None:
+        """The record that is repeated next; None behind the last one."""
+        return self._next
+
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
         self._watcher.begins("setup", self.node.name)

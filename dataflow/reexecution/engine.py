@@ -22,6 +22,7 @@ from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.records.repetition import Repetition, look_at
+from dataflow.reexecution.in_turn import RunnerInTurn, Turns
 from dataflow.reexecution.needed import NeededStreams, first_needed
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
@@ -87,7 +88,8 @@ class Recomputation:
 
     Re-execution begins at the stamp `begin` (see `dataflow.records.repetition`) and ends before the firings from `end`
     on; `slices` are operators of which only the calls between two stamps are repeated (see `verification.slices`).
-    `guard` watches over the memory of what they are given; `live_effects`: see `RecordedJournal`.
+    `guard` watches over the memory of what they are given; `live_effects`: see `RecordedJournal`. `in_turn`: operators
+    whose calls are made in the order of the run (`RunnerInTurn`).
     `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
     ends of the streams that are made.
     """
@@ -108,6 +110,7 @@ class Recomputation:
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
         live_effects: bool = False,
+        in_turn: Collection[str] = (),
     ) -> None:
         self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
         ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
@@ -116,15 +119,16 @@ class Recomputation:
         begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
-        repetitions = _repetitions(nodes, records, begins)
+        repeated = _repetitions(nodes, records, begins)
         taken = {stream for node in nodes for stream in node.taken}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
+        made_as = dict.fromkeys(in_turn, partial(RunnerInTurn, turns=Turns()))
         self.runners = {
-            node.name: RecordedRunner(
+            node.name: made_as.get(node.name, RecordedRunner)(
                 node,
                 outlet,
                 static=graph.static,
-                repetition=repetitions[node.name],
+                repetition=repeated[node.name],
                 inputs=inputs,
                 seed=graph.seed,
                 seeding=seeding_of(recording),
@@ -136,15 +140,14 @@ class Recomputation:
         }
         for runner in self.runners.values():
             self._driver.add(runner)
-        reads = sorted({*feeding.streams, *feeding.besides})
-        makers = {stream: graph.streams[stream].node for stream in reads}
+        makers = {stream: graph.streams[stream].node for stream in sorted({*feeding.streams, *feeding.besides})}
         starts = None if begin is None else first_needed(log, graph, self.runners.values())
         self._feed = LogFeed(
             recording if starts is None or begin is None else NeededStreams(recording, starts, begin),
             makers,
             _HandOver(self._driver, frozenset(feeding.besides), read, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
-            finals=final_stamps(recording, reads),
+            finals=final_stamps(recording, makers),
             end=end,
         )
         self._driver.feeding.feeds.append(self._feed)

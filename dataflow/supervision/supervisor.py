@@ -273,7 +273,7 @@ class Supervisor:
 
     def _tick(self) -> None:
         if (lost := self._clock.take_lost()) > PAUSE:
-            self._feed(events.Paused(lost + LONGEST_STEP))
+            self._feed(events.Paused(lost + LONGEST_STEP, lost))
         self._here.tick()
         self._feed(events.Tick())
 

@@ -62,8 +62,8 @@ class VerifyReport:
     operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
     `absent` are operators whose code is not here, and why: their messages are taken from the recording.
     `changes` are, by operator, what the graph has otherwise than the recorded one.
-    `shared` are operators that make what was recorded, but not always in one process with those named; `mates` are, by
-    operator, those that ran in its process.
+    `shared` are operators that make what was recorded, but not always in one process with those named; `overwritten`
+    are, by operator, the one of its process that wrote into what it was given; `mates`, those that ran in its process.
     """
 
     operators: tuple[Verification, ...]
@@ -91,6 +91,7 @@ class VerifyReport:
     absent: Mapping[str, str] = field(default_factory=dict)
     changes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    overwritten: Mapping[str, str] = field(default_factory=dict)
     mates: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
@@ -141,7 +142,8 @@ class VerifyReport:
             return "changed" if changed else verification.verdict
         if self.tolerance is None or compared is None or verification.wrote:
             return verification.verdict
-        return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
+        own = compared.own and verification.operator not in self.overwritten
+        return "within tolerance" if compared.tolerated else "culprit" if own else "downstream"
 
     def repeats(self, operator: str) -> bool | None:
         """Returns whether a culprit differed twice alike; None where it was not run twice."""
@@ -193,6 +195,7 @@ class VerifyReport:
             "unchecked": list(self.unchecked),
             "absent": dict(self.absent),
             "changes": {name: list(changes) for name, changes in self.changes.items()},
+            "overwritten": dict(self.overwritten),
             "shared": {name: list(beside) for name, beside in self.shared.items()},
             "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
         }

@@ -24,7 +24,7 @@ class Trial:
     """Operators to be re-executed in one process to their end, or until each of those `asked` has differed otherwise
     than first at the place, and by the result, that is given for it (None: than not at all).
 
-    `wired`: they are given what they make themselves, as in the run, not what was recorded of it.
+    `wired`: as in the run, they are called in its order, and given what they make, not what was recorded of it.
     """
 
     operators: frozenset[str]
@@ -42,13 +42,20 @@ class Retrial:
     `repeated`: whether both times they made the same, to the end, in the process that they had. `instead` are the
     answers that count for operators rather than those of the first trial. `shared` names, by operator that makes what
     was recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
-    operators wrote into, by operator.
+    operators wrote into, by operator. `overwritten`: who, of its process, wrote into what an operator was given up to
+    its first difference, by operator: what it had was not what was recorded.
     """
 
     repeated: dict[str, bool] = field(default_factory=dict)
     instead: dict[str, Answer] = field(default_factory=dict)
     shared: dict[str, tuple[str, ...]] = field(default_factory=dict)
     wrote: dict[str, str] = field(default_factory=dict)
+    overwritten: dict[str, str] = field(default_factory=dict)
+
+    def enter(self, found: Verification) -> None:
+        """Enters what was found of an operator's own writing, and of another's, into what the first trial found."""
+        found.wrote = found.wrote or self.wrote.get(found.operator, "")
+        found.own_fault &= found.operator not in self.overwritten
 
 
 def retry(
@@ -58,14 +65,14 @@ def retry(
     outcome = Retrial()
     first = {name: _first(of[name], name) for name in culprits}
     told = _try(outcome, _grouped(first, mates), attempt)
-    alike = [name for name in told if _alike(told[name], of[name], name)]
-    outcome.repeated.update(dict.fromkeys(alike, True))
-    _acquit_in_company(outcome, [name for name in alike if len(mates[name]) > 1], of, mates, attempt)
-    apart = {name: answer for name, answer in told.items() if name not in alike}
-    outcome.repeated.update(dict.fromkeys(apart, False))
-    others = {name: answer for name, answer in apart.items() if _others(of[name], answer)}
+    outcome.repeated.update({name: _alike(answer, of[name], name) for name, answer in told.items()})
+    differ = [name for name, answer in told.items() if _first(answer, name) is not None and len(mates[name]) > 1]
+    _acquit_in_company(outcome, differ, of, mates, attempt)
+    apart = {name: told[name] for name, alike in outcome.repeated.items() if not alike}
+    others = {n: a for n, a in apart.items() if of[n]["operators"].keys() != a["operators"].keys()}
     _acquit_apart(outcome, {n: a for n, a in others.items() if _first(a, n) is None}, of, attempt)
     _confirm(outcome, {n: a for n, a in others.items() if _first(a, n) is not None}, mates, attempt)
+    _acquit_overwritten(outcome, told, of)
     return outcome
 
 
@@ -78,7 +85,7 @@ def _acquit_apart(outcome: Retrial, suspects: Mapping[str, Answer], of: Mapping[
         if _alike(answer, of[name], name):
             del outcome.repeated[name]
             outcome.instead[name] = suspects[name]
-            outcome.shared[name] = _others(of[name], suspects[name])
+            outcome.shared[name] = _others(of[name], suspects[name]) or _others(suspects[name], of[name])
 
 
 def _acquit_in_company(
@@ -88,7 +95,7 @@ def _acquit_in_company(
     mates: Mapping[str, frozenset[str]],
     attempt: Try,
 ) -> None:
-    """Acquits operators that had company if they make what was recorded alone, or given what that company makes."""
+    """Acquits operators that had company if they make what was recorded alone, or as they were called in the run."""
     for name in suspects:
         for trial in Trial(frozenset({name}), {name: None}), Trial(mates[name], {name: None}, wired=True):
             try:
@@ -115,6 +122,15 @@ def _confirm(
             if _alike(answer, suspects[name], name):
                 outcome.repeated[name] = True
                 outcome.instead[name] = answer
+
+
+def _acquit_overwritten(outcome: Retrial, told: Mapping[str, Answer], of: Mapping[str, Answer]) -> None:
+    """Acquits those that were given what an operator of the process that they had has written into by then."""
+    for name in [name for name in outcome.repeated if name not in outcome.wrote]:
+        writer, since = told[name]["reached"].get(name, ("", 0))
+        if writer and since <= of[name]["operators"][name]["first"]["stamp"]:
+            del outcome.repeated[name]
+            outcome.overwritten[name] = writer
 
 
 def _grouped(first: Mapping[str, First | None], mates: Mapping[str, frozenset[str]]) -> list[Trial]:

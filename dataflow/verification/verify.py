@@ -135,7 +135,7 @@ def verify(
     if envs := dict.fromkeys(played.nodes[name].env for name in task.operators if name in left):
         answers += attempt([({}, _in(env, played, left, task.operators, task.held)) for env in envs])
     answers.append(divided)
-    report = _report(task, answers, tolerance, start)
+    report = _report(task, answers, tolerance, start, Retrial())
     if report.culprits:
         differing = [v.operator for v in report.operators if v.operator in report.culprits and v.first is not None]
         retrial = _retry(task, differing, answers, attempt)
@@ -156,6 +156,7 @@ def _request(task: _Task, path: Path, tolerance: float | None, *, paranoid: bool
         "slices": {},
         "until": {},
         "guard": paranoid,
+        "in_turn": (),
         "live_effects": live_effects,
     }
 
@@ -300,15 +301,14 @@ def _report(
     answers: Sequence[Mapping[str, Any]],
     tolerance: float | None,
     start: float | None,
-    retrial: Retrial | None = None,
+    retrial: Retrial,
 ) -> VerifyReport:
-    retrial = retrial or Retrial()
     of = {**_answer_of_each(answers), **retrial.instead}
     found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}
     stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
     for name in task.operators:
         task.ledger.enter(found[name])
-        found[name].wrote = found[name].wrote or retrial.wrote.get(name, "")
+        retrial.enter(found[name])
     for name, stream in task.unfed.items():
         calls = task.books.of(name).calls
         found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
@@ -353,8 +353,15 @@ def _report(
         changes=task.changes,
         repeated=retrial.repeated,
         shared=retrial.shared,
-        mates={name: tuple(sorted(mates - {name})) for name, mates in mates_of(task.placed, task.operators).items()},
+        overwritten=retrial.overwritten,
+        mates=_mates(task),
     )
+
+
+def _mates(task: _Task) -> dict[str, tuple[str, ...]]:
+    """Returns the operators beside which each ran in its process, whether or not they are verified."""
+    mates = mates_of(task.placed, [name for name, node in task.graph.nodes.items() if not node.source])
+    return {name: tuple(sorted(mates[name] - {name})) for name in task.operators}
 
 
 def _count_calls(task: _Task, found: Mapping[str, Verification], comparisons: Mapping[str, OutputComparison]) -> None:
@@ -407,7 +414,8 @@ def _retry(task: _Task, culprits: Iterable[str], answers: Sequence[Mapping[str, 
             chosen = with_makers(task.held - made, task.graph, set(trial.operators))
             operators = tuple(name for name in task.operators if name in chosen)
             incomplete = sorted(task.incomplete.union(made))
-            calls.append(({"until": dict(trial.asked), "incomplete": incomplete, "guard": True}, operators))
+            asked = {"until": dict(trial.asked), "incomplete": incomplete, "guard": True}
+            calls.append(({**asked, "in_turn": sorted(trial.operators) if trial.wired else ()}, operators))
         at_once = len(task.parts)
         return [answer for k in range(0, len(calls), at_once) for answer in attempt(calls[k : k + at_once])]
 

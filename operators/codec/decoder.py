@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CompressedDepth, CompressedImage, DepthImage, Diagnostics, Image, Level, Message
 from dataflow.operator import In, Operator, Out, Param
+from operators.passed_over import PassedOver
 from operators.status import counted_status
 
 
@@ -32,12 +34,16 @@ class ImageDecoder(Operator):
 
     max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
+    @cached_property
+    def _passed_over(self) -> _Reported:
+        return _Reported(self.log, strict=False)
+
     def process(self, compressed: CompressedImage) -> Mapping[str, Message]:
         """Raises ValueError for a file of more than `max_pixels`."""
         try:
             return {"image": self.decode(compressed)}
         except UndecodableError as error:
-            return {"status": _passed_over(self, "image_decoder", compressed, error)}
+            return {"status": self._passed_over.report("image_decoder", compressed.stamp, error)}
 
     def decode(self, compressed: CompressedImage) -> Image:
         """Returns the image. Raises ValueError where the bytes are not a whole one."""
@@ -65,12 +71,16 @@ class DepthDecoder(Operator):
 
     max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
 
+    @cached_property
+    def _passed_over(self) -> _Reported:
+        return _Reported(self.log, strict=False)
+
     def process(self, compressed: CompressedDepth) -> Mapping[str, Message]:
         """Raises ValueError for a file of more than `max_pixels`."""
         try:
             return {"depth": self.decode(compressed)}
         except UndecodableError as error:
-            return {"status": _passed_over(self, "depth_decoder", compressed, error)}
+            return {"status": self._passed_over.report("depth_decoder", compressed.stamp, error)}
 
     def decode(self, compressed: CompressedDepth) -> DepthImage:
         """Returns the depth image. Raises ValueError where the bytes are not a whole file of one."""
@@ -81,9 +91,12 @@ class DepthDecoder(Operator):
         return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
 
 
-def _passed_over(operator: Operator, name: str, message: Message, error: UndecodableError) -> Diagnostics:
-    operator.log.warning("passed over: %s", error)
-    return counted_status(name, message.stamp, f"passed over: {error}", Level.WARN, {})
+class _Reported(PassedOver):
+    """Reports each file that is passed over on the status stream, and few of them in the log."""
+
+    def report(self, name: str, stamp: int, error: UndecodableError) -> Diagnostics:
+        self.take(error)
+        return counted_status(name, stamp, f"passed over: {error}", Level.WARN, {})
 
 
 def depth_in_metres(levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float) -> NDArray[np.float32]:

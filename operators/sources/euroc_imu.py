@@ -15,7 +15,7 @@ from ruamel.yaml.error import YAMLError
 from dataflow.messages import Imu, Message, Pose
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
-from operators.sources.passed_over import PassedOver
+from operators.passed_over import PassedOver
 
 Array = NDArray[np.float64]
 

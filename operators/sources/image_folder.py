@@ -17,8 +17,8 @@ import numpy as np
 
 from dataflow.messages import Message
 from dataflow.operator import Duration, Param, SourceError
+from operators.passed_over import TRIED, PassedOver
 from operators.sources.pacing import frame_stamp
-from operators.sources.passed_over import TRIED, PassedOver
 from operators.sources.video import CalibratedImages, Pixels
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dataflow.messages import CameraInfo, Image, Message, Pose
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
+from operators.passed_over import TRIED, PassedOver
 from operators.sources.pacing import frame_stamp
-from operators.sources.passed_over import TRIED, PassedOver
 
 Array = NDArray[np.float64]
 FOLDERS = (("image_l", "image_r"), ("image_0", "image_1"), ("image_2", "image_3"))

@@ -14,9 +14,9 @@ from dataflow.messages import CameraInfo, Image, Imu, Message, NavSatFix, Odomet
 from dataflow.messages.geometry import invert
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
+from operators.passed_over import TRIED, PassedOver
 from operators.sources.kitti_files import Numbers, calibration_files, files_in, read_stamps
 from operators.sources.kitti_oxts import messages_of, read_packet
-from operators.sources.passed_over import TRIED, PassedOver
 
 Array = NDArray[np.float64]
 

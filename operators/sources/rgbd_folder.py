@@ -15,7 +15,7 @@ from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Tran
 from dataflow.messages.depth_units import FIFTHS, INVALID, MILLIMETRES, DepthSpan
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
-from operators.sources.passed_over import TRIED, PassedOver
+from operators.passed_over import TRIED, PassedOver
 from operators.sources.rgbd_layouts import (
     Dataset,
     Frame,

@@ -32,3 +32,20 @@ def test_a_message_that_several_were_given_is_the_input_of_the_writer(
 
     assert guard.changed(writer) == f"{whose} (FeatureVector at stamp 7)"
     assert not guard.changed(writer)
+
+
+@pytest.mark.parametrize("order", ["reader first", "writer first"])
+def test_one_that_is_given_a_message_before_or_after_another_writes_into_it_is_reached(order: str) -> None:
+    guard, before, given = MemoryGuard(keeping=True), entry("x", 6, 0), entry("x", 7, 1)
+    guard.take("bystander", Firing(6, "fire", inputs={"x": before}))
+    if order == "reader first":
+        guard.take("reader", Firing(9, "fire", inputs={"x": given}))
+    guard.take("writer", Firing(7, "fire", inputs={"x": given}))
+    rows = np.asarray(given.value.vectors)
+    rows.flags.writeable = True
+    rows += 1
+    guard.changed("writer")
+    if order == "writer first":
+        guard.take("reader", Firing(9, "fire", inputs={"x": given}))
+
+    assert guard.reached == {"reader": ("writer", 9)}

@@ -6,8 +6,12 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingWriter, describe, machine_facts
+from dataflow.recording.layout import FLIGHT
+from dataflow.recording.streams.cutting import triggers_of
 
 
 def test_a_description_counts_rates_sizes_firings_and_metadata(tmp_path: Path, pose: Callable[..., Pose]) -> None:
@@ -48,3 +52,16 @@ def test_machine_facts_are_text_sorted_and_repeatable() -> None:
     for mapping in facts.values():
         assert list(mapping) == sorted(mapping)
         assert all(isinstance(value, str) for value in mapping.values())
+
+
+@pytest.mark.parametrize(
+    ("triggers", "said"),
+    [
+        ('[{"what": "c failed (a.py:4)", "stamp": 5}, {"what": "asked for"}]', ["c failed (a.py:4)", "asked for"]),
+        ("[", []),
+        ("{}", []),
+        ('[1, {"stamp": 5}]', []),
+    ],
+)
+def test_what_a_flight_recorder_kept_says_why(triggers: str, said: list[str]) -> None:
+    assert triggers_of({FLIGHT: {"triggers": triggers}}) == said

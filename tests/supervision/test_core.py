@@ -496,6 +496,7 @@ def test_a_report_has_what_processes_handed_in() -> None:
     play = Play(record="run.mcap").starts()
     play.tell(play.progress("left", {"left": 70}, drops={"sum": [["x", "full", 2]]}))
     play.now += 2.5
+    play.tell(Paused(6.5, uncounted=6.0))
     counts = {"left": {"left": [3, 6, 0, 9, 90, 12]}, "sum": {"sum": [2, 0, 0, 5, 80, 7]}, "@recorder": {}}
     more = {
         "left": {"streams": {"test/left/fast": [3, "abc"]}},
@@ -512,7 +513,7 @@ def test_a_report_has_what_processes_handed_in() -> None:
     assert (report.drops, report.waits) == ({"sum": (("x", "full", 2),)}, {"sum": (("x", "late", 1),)})
     assert report.summaries == {"sum": {"mean": 4.5}}
     assert (report.last, report.sources, report.interrupted) == (90, ("left",), False)
-    assert report.wall == pytest.approx(2.5, abs=0.2)
+    assert report.wall == pytest.approx(8.5, abs=0.2)
     assert set(report.files) == {"@recorder"}
     leave = dict(sent(play.commands, "leave"))
     assert leave["@recorder"]["summaries"] == {"sum": {"mean": 4.5}}

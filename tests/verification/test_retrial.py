@@ -19,7 +19,7 @@ from dataflow.verification.verify import verify
 Placement = Literal["one_process", "process_each"]
 
 
-def recorded(path: Path, operators: str, placement: Placement = "process_each") -> Path:
+def recorded(path: Path, operators: str, placement: Placement = "process_each", live: bool = False) -> Path:
     """A run of operators (`name: Class`, and parameters) that all take the matrices of one source."""
     lines = ["graph: test", "operators:", "  src: {use: 'sharing_operators:Matrices'}"]
     for line in operators.splitlines():
@@ -29,7 +29,7 @@ def recorded(path: Path, operators: str, placement: Placement = "process_each") 
         params = f"params: {more}" if more.startswith("{") else ""
         fields = [f"use: 'sharing_operators:{use}'", f"inputs: {{x: {taken}}}", params]
         lines.append(f"  {name}: {{{', '.join(filter(None, fields))}}}")
-    run(load_text("\n".join(lines)), placement=placement, record=path)
+    run(load_text("\n".join(lines)), placement=placement, record=path, live=live)
     return path
 
 
@@ -95,6 +95,33 @@ def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_cul
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("since", [0, 5])
+def test_one_that_had_a_message_before_and_after_another_wrote_into_it_is_no_culprit(
+    tmp_path: Path, since: int
+) -> None:
+    path = recorded(tmp_path / "run.mcap", f"solve: Solve {{since: {since}}}\nlate: Late", "one_process")
+
+    report = verify(path, jobs=1)
+
+    assert verdicts(report) == {"solve": "culprit", "late": "identical"}
+    assert report.shared == {"late": ("solve",)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("live", [False, True])
+def test_operators_that_shared_a_module_in_the_run_are_called_in_its_order(
+    tmp_path: Path, jobs: int, live: bool
+) -> None:
+    path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count\nthree: Count from one/out", "one_process", live)
+
+    report = verify(path, jobs=jobs)
+
+    assert verdicts(report) == dict.fromkeys(("one", "two", "three"), "identical")
+    assert report.shared.keys() >= {"one", "two"}
+
+
+@pytest.mark.long
 def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_with_those_beside(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count", "one_process")
 
@@ -102,13 +129,14 @@ def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_wi
 
     assert report.culprits == ("one",)
     assert report.repeats("one")
+    assert report.mates == {"one": ("two",)}
 
 
 def answer(differences: str, got: str = "b") -> dict[str, Any]:
     """What a trial of the operator `clock` shows, which differs from its third call on."""
     found = Verification("clock", firings=9, verified=9, outputs=9, differing=4, differences=differences)
     found.first, found.own_fault = Difference(3, "fire", 30, "out", "a", got), True
-    return {"operators": {"clock": asdict(found)}}
+    return {"operators": {"clock": asdict(found)}, "reached": {}}
 
 
 @pytest.mark.parametrize(
@@ -125,6 +153,18 @@ def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict
 
     assert found.repeated == {"clock": repeats}
     assert asked[0] == Trial(frozenset({"clock"}), {"clock": (0, 3, "b")})
+
+
+@pytest.mark.parametrize(("since", "downstream"), [(20, True), (30, True), (31, False)])
+def test_a_message_that_was_written_into_counts_where_it_came_before_the_difference(
+    since: int, downstream: bool
+) -> None:
+    again = {**answer("1"), "reached": {"clock": ["writer", since]}}
+
+    found = retry(["clock"], {"clock": answer("1")}, {"clock": frozenset({"clock"})}, lambda trials: [again])
+
+    assert found.overwritten == ({"clock": "writer"} if downstream else {})
+    assert found.repeated == ({} if downstream else {"clock": True})
 
 
 def test_a_parameter_that_another_graph_changes_is_named(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def info(
 def _facts(described: Description) -> Table:
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.recording.mcap.attachments import tells_of_run
-    from dataflow.recording.streams.cutting import cut_of
+    from dataflow.recording.streams.cutting import cut_of, triggers_of
     from dataflow.recording.streams.facts import group_of
     from dataflow.sync.stamps import format_stamp
 
@@ -122,6 +122,8 @@ def _facts(described: Description) -> Table:
     if (part := cut_of(made)) is not None:
         ends = [f"{word} {format_stamp(s)}" for word, s in (("from", part.start), ("to", part.end)) if s is not None]
         row("part of", " ".join([part.of, *ends]))
+    for why in triggers_of(made):
+        row("kept because", why)
     if RECOVERED in made:
         row("recovered", f"from {made[RECOVERED].get('of', '')}: what could be read of it", "yellow")
     if described.torn:

@@ -182,10 +182,12 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         yield f"{v.operator}: run a second time, it differed alike: {_since(report, v)}"
     if v.wrote:
         yield f"{v.operator}: it changed the memory of {v.wrote}; messages are immutable: copy before writing"
+    elif writer := report.overwritten.get(v.operator):
+        yield f"{v.operator}: {writer}, which ran in its process, wrote into a message that it was given"
     elif judged.verdict == "culprit" and (mates := report.mates.get(v.operator)):
         yield (
             f"{v.operator}: in the run it shared a process with {', '.join(mates)}; what operators keep in a module or "
-            "set in a library reaches others of their process, and is not repeated: keep it in self"
+            "set in a library reaches others of their process: keep it in self"
         )
     if report.start is not None and v.began == "start" and not v.unknown:
         yield f"{v.operator}: keeps state and the recording has no snapshot of it there: repeated from its beginning"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dataflow.recording.layout import CUT
+from dataflow.recording.layout import CUT, FLIGHT
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,16 @@ def cut_of(metadata: Mapping[str, Mapping[str, str]]) -> Cut | None:
     if found is None:
         return None
     return Cut(found.get("of", ""), _stamp(found.get("start", "")), _stamp(found.get("end", "")))
+
+
+def triggers_of(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Why a flight recorder kept the recording, in words; empty where none did."""
+    try:
+        found = json.loads(metadata.get(FLIGHT, {}).get("triggers", "[]"))
+    except ValueError:
+        return []
+    told = found if isinstance(found, list) else []
+    return [str(one["what"]) for one in told if isinstance(one, dict) and "what" in one]
 
 
 def _stamp(text: str) -> int | None:

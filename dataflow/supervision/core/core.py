@@ -79,7 +79,9 @@ class Core:
                 self._barrier.begin()
             case Tick():
                 self._tick()
-            case Paused(seconds):
+            case Paused(seconds, uncounted):
+                if self.run.under_way:
+                    self.run.paused += uncounted
                 self.run.event(
                     "paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process"
                 )

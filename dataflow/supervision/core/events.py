@@ -32,9 +32,11 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Paused:
-    """The supervisor did not run for so many seconds: it, or the whole machine, was stopped. No clock went on."""
+    """The supervisor did not run for so many seconds: it, or the whole machine, was stopped. `uncounted` are
+    those of them that the steady clock has not counted."""
 
     seconds: float
+    uncounted: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

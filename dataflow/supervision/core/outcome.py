@@ -33,7 +33,7 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
         files={p.label: p.facts for p in run.processes.values() if p.is_sink},
         first=status.began if status.first is None else status.first,
         last=max(reached, default=None),
-        wall=0.0 if run.release is None else ended_at - run.release.at.steady,
+        wall=0.0 if run.release is None else ended_at - run.release.at.steady + run.paused,
         interrupted=interrupted,
         notes=tuple(status.notes),
         sources=tuple(node.name for node in run.graph.sources() if node.name in status.operators),

@@ -51,6 +51,8 @@ class RunState:
         self.status = Status()
         self.now = Moment(0.0, 0.0)
         self.release: Release | None = None
+        self.paused = 0.0
+        """Seconds of the run for which the supervisor did not run, and `steady` stood still."""
         self._clocks: dict[str, float] = {}
         self.unreachable: dict[str, str] = {}
         """By process on a machine of which nothing is heard, that machine."""

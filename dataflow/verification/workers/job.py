@@ -26,9 +26,10 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
     `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (by operator a first
     difference, as `retrial.First`, or None: once each has differed, and not first so, the rest is left), `guard` (watch
-    over messages in every call), `live_effects` (make them again).
+    over messages in every call), `live_effects` (make them again), `in_turn` (operators called in the run's order).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
-    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator.
+    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator;
+    `reached`: see `MemoryGuard`.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"], watch=board.goes_on) as recording:
@@ -37,12 +38,13 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         log = FiringLog.from_wire(request["records"], recording)
         tolerance: float | None = request["tolerance"]
         comparer = Comparer(recording, graph, feeding.operators, tolerance, lambda name: work.runners[name].record)
-        checks = _checks(recording, graph, log, request)
+        checks, slices = _checks(recording, graph, log, request), request["slices"]
 
         def read(stream: str, entry: Entry) -> None:
             if stream in checks:
                 checks[stream].take((entry.incarnation, entry.seq), entry.digest)
 
+        guard = MemoryGuard(keeping=True) if request["guard"] else None
         work = Recomputation(
             recording,
             graph,
@@ -50,24 +52,21 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             log,
             made=comparer.made,
             read=read,
-            begin=request["begin"],
-            slices=request["slices"],
-            guard=MemoryGuard(keeping=True) if request["guard"] else None,
+            guard=guard,
             watcher=board,
-            live_effects=request["live_effects"],
+            **{option: request[option] for option in ("begin", "slices", "live_effects", "in_turn")},
         )
         until = [(work.runners[name].result, first) for name, first in request["until"].items()]
         results = work.run(until=lambda: bool(until) and all(_differs(*one) for one in until))
-        compared = comparer.close(results)
+        compared = comparer.close(results).items()
         stored = [check.result().to_wire() for check in checks.values()]
-    slices = request["slices"]
     counts = {
         name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns] for name, r in work.runners.items()
     }
     return {
         "operators": {name: result.to_wire() for name, result in results.items() if name not in slices},
         "slices": {name: {"operator": results[name].to_wire(), "work": counts[name]} for name in slices},
-        "comparisons": {name: asdict(comparison) for name, comparison in compared.items() if name not in slices},
+        "comparisons": {name: asdict(comparison) for name, comparison in compared if name not in slices},
         "stored": stored,
         "digests": {
             state.stream: [state.digest.count, state.digest.hexdigest()]
@@ -78,6 +77,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "work": {name: values for name, values in counts.items() if name not in slices},
         "reading": work.reading_cpu_ns,
         "wall": work.wall,
+        "reached": guard.reached if guard else {},
     }
 
 

@@ -120,3 +120,14 @@ def test_bytes_behind_a_file_do_no_harm_and_the_end_of_a_preview_is_not_its_end(
         name = "png" if data.startswith(b"\x89PNG") else "jpeg"
         message = CompressedImage(stamp=stamp, frame="cam", format=name, data=np.frombuffer(data, np.uint8))
         assert list(ImageDecoder().process(message)) == (["image"] if decodes else ["status"]), stamp
+
+
+def test_a_dead_camera_fills_the_status_and_not_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    broken = encoded(ramp(), ".jpg")[:-9]
+    files = [CompressedImage(stamp=STAMP + k, frame="cam", format="jpeg", data=broken) for k in range(40)]
+
+    out = play(ImageDecoder(), {"compressed": files})
+
+    assert len(out["status"]) == 40
+    assert len(caplog.messages) == 6
+    assert caplog.messages[-1].endswith("passed over (32 so far)")

@@ -1,10 +1,8 @@
-"""Counts the files of a dataset that cannot be read and are passed over, and names them in the log."""
+"""Counts the files that cannot be read and are passed over, and names them in the log."""
 
 from __future__ import annotations
 
 import logging
-
-from dataflow.operator import SourceError
 
 TRIED = 100
 """Frames of which one has to be readable: else it is not a matter of single files."""
@@ -17,7 +15,7 @@ class PassedOver:
         self._log, self._strict = log, strict
         self.number = 0
 
-    def take(self, error: SourceError) -> None:
+    def take(self, error: Exception) -> None:
         """Passes over what an error names; raises it where that is not allowed."""
         if self._strict:
             raise error
