@@ -363,6 +363,8 @@ class EkfFusion(Operator):
         others = {}
         if (count := self.state.filter.hypotheses) > 1:
             others["filter"] = f"{count} headings in question"
+        if self.state.filter.doubted_heading:
+            others["heading"] = "the first heading that was told may be wrong: others explain as much"
         if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
         if stamp - self.state.filter.restarted < _ANEW:
