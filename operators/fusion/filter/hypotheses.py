@@ -15,10 +15,9 @@ _LIKELY = 5.0
 """Logarithm of the ratio of weights beyond which a hypothesis does not count."""
 _FOLLOWED = 20_000_000_000
 """Nanoseconds in motion for which headings are followed against the one told: nothing shows a heading at rest."""
-_DOUBTED, _TRUSTED = 0.05, 0.01
+_DOUBTED, _TRUSTED = 0.03, 0.01
 """Probability that what was told of the first heading is wrong, from which it is in question, and until which. Headings
-against it begin with 0.01 in all, and by Ville's inequality a right one comes into question once in five times at most.
-"""
+against it begin with 0.01 in all: by Ville's inequality a right one comes into question once in three times at most."""
 
 
 def with_errors(node: Node, sigmas: Sequence[float]) -> Node:

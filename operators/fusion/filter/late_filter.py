@@ -40,6 +40,7 @@ from operators.fusion.filter.history import (
 )
 from operators.fusion.filter.hypotheses import combined, doubted, likely, moves, reduced, refuted, with_errors
 from operators.fusion.filter.measurements import Measurement
+from operators.fusion.filter.repeats import repeat_of
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.filter.suspicions import CHANCE, Suspicions
 
@@ -311,11 +312,12 @@ class LateFilter(Remembered):
         if not fits and unplaced(state, kind):
             hypotheses = _brought(hypotheses, found)
             found, scores, best = self._found(entry, hypotheses, node)
+        health = replace(health, repeat=repeat_of(health.repeat, entry, state))
         doubt = Doubt(entry.time, residual, entry.noise, kind)
         unfelt = self._config.unfelt
         nis = scores[best][0]
         leapt = 0.0 if unfelt is None else leap(config, entry.sensor, doubt, node.health, state, H, nis, unfelt)
-        verdict = judge(config, health.doubts, doubt, state, H, nis, leapt > 0)
+        verdict = judge(config, health.doubts, doubt, state, H, nis, leapt > 0 or health.frozen, health.idle)
         after = health.after(verdict, entry.time, nis, doubt, config, leapt)
         if verdict == "widened":
             since = (entry.time - (health.last_used or self._nodes[0].time)) * 1e-9
