@@ -49,6 +49,8 @@ TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
+_YOUNG = 1e-3
+"""Probability that a filter of less than a window's age differs so much from a fit by chance."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -149,6 +151,7 @@ class LateFilter(Remembered):
         """Fits the motion of late anew, once a second: shows errors of sensors, or that the estimate is wrong.
 
         An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
+        One that is older than the window knows more than the fit, and is looked at for hours: chance has to be rarer.
         """
         node, before = self._newest(), self.suspicion
         sure = len(likely(node.hypotheses)) == 1 and not node.refuted
@@ -163,7 +166,8 @@ class LateFilter(Remembered):
         off = difference(own, fit.end)[ROTATION]
         late = before is None and self.suspicion is not None  # stamps, which from now on are taken for what they are
         spread = own.covariance[ROTATION, ROTATION] + fit.end.covariance[ROTATION, ROTATION]
-        if late or float(off @ np.linalg.solve(spread, off)) > threshold(1 - CHANCE, 3):
+        chance = CHANCE if node.window.first else _YOUNG
+        if late or float(off @ np.linalg.solve(spread, off)) > threshold(1 - chance, 3):
             covariance = own.covariance.copy()
             covariance[:SIZE, SIZE:], covariance[SIZE:, :SIZE] = 0.0, 0.0
             covariance[:SIZE, :SIZE] = fit.end.covariance
