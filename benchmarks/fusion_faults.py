@@ -104,6 +104,7 @@ def sensed(fault: Fault, seed: int, seconds: int) -> tuple[list[tuple[int, str, 
         if fault.unplugged and fault.begin <= wheels.stamp * 1e-9 < fault.end:
             wheels = wheels.replace(linear=np.zeros(3), angular=np.zeros(3))
         events.append((wheels.stamp, "wheels", wheels))
+    events = [e for e in events if e[0] <= samples[-1].stamp]
     return sorted(events, key=lambda e: e[:2]), truth, extrinsics, heading + fault.heading
 
 

@@ -316,7 +316,7 @@ class LateFilter(Remembered):
         if not fits and unplaced(state, kind):
             hypotheses = _brought(hypotheses, found)
             found, scores, best = self._found(entry, hypotheses, node)
-        health = replace(health, repeat=repeat_of(health.repeat, entry, state))
+        health = replace(health, repeat=repeat_of(health.repeat, entry, state, fits))
         doubt = Doubt(entry.time, residual, entry.noise, kind)
         unfelt = self._config.unfelt
         nis = scores[best][0]
