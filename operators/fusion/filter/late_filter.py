@@ -151,7 +151,7 @@ class LateFilter(Remembered):
         """Fits the motion of late anew, once a second: shows errors of sensors, or that the estimate is wrong.
 
         An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
-        One that is older than the window knows more than the fit, and is looked at for hours: chance has to be rarer.
+        One that is older than the window holds more than the fit, and is looked at for hours: chance has to be rarer.
         """
         node, before = self._newest(), self.suspicion
         sure = len(likely(node.hypotheses)) == 1 and not node.refuted

@@ -203,7 +203,8 @@ def test_positions_that_jump_are_named_and_not_followed_since_the_inertial_senso
     assert "robot/wheels" not in run.alarms
 
 
-@pytest.mark.parametrize("wheels", [pytest.param(True, marks=pytest.mark.long), False])
+@pytest.mark.long
+@pytest.mark.parametrize("wheels", [True, False])
 def test_positions_that_repeat_while_the_robot_drives_on_are_frozen_and_used_again_when_they_move(wheels: bool) -> None:
     drive = Drive(11.0)
     run = Run(drive, drive.fixes(frozen=(6.0, 9.0)), *([drive.wheels(1.0)] if wheels else []))
