@@ -1,4 +1,4 @@
-"""Alarms of a fusion: which sensors contradict the rest, made it yield, or come too late."""
+"""Alarms of a fusion: which sensors contradict the rest, made it yield, come too late, or are of no use."""
 
 from __future__ import annotations
 
@@ -20,9 +20,18 @@ class Alarms(Remembered):
     _reported: int
     _raised: set[str]
     _late: dict[str, tuple[int, int]]
+    _useless: dict[str, tuple[int, str]]
 
     def __init__(self) -> None:
-        self._reported, self._raised, self._late = -1, set(), {}
+        self._reported, self._raised, self._late, self._useless = -1, set(), {}, {}
+
+    def of_use(self, name: str) -> None:
+        """Takes note that a sensor's message gave measurements."""
+        self._useless.pop(name, None)
+
+    def of_no_use(self, name: str, reason: str) -> None:
+        """Takes note that a sensor's message gave none."""
+        self._useless[name] = self._useless.get(name, (0, ""))[0] + 1, reason
 
     def due(
         self,
@@ -48,14 +57,16 @@ class Alarms(Remembered):
     def _standing(
         self, stamp: int, health: Mapping[str, Health], ignored: Mapping[str, int], gates: Mapping[str, GateConfig]
     ) -> dict[str, str]:
-        found: dict[str, str] = {}
+        found = {name: f"of no use: {reason}" for name, (times, reason) in self._useless.items() if times > 1}
         for name, h in health.items():
             if h.room is not None and stamp - h.room <= _RECENT:
                 found[name] = "the filter made room for it: one of them was wrong"
             elif h.contradicts and h.doubts and not never_yields(gates.get(name.partition(" ")[0], _ANY)):
                 recent = stamp - h.doubts[-1].time <= _RECENT
                 text = "contradicts the others"
-                if h.leap:
+                if h.frozen:
+                    text = "frozen: it repeats a position that the body has left"
+                elif h.leap:
                     text += ": it leapt, and the inertial sensor felt nothing"
                 found |= {name: text} if recent else {}
         for key, count in ignored.items():

@@ -86,7 +86,8 @@ class EkfFusion(Operator):
     Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
     chi-square gate refuses what does not fit; measurements that fit only because the filter's covariance is large wait
     for a second one that agrees, and refused ones that agree for a second show the filter to be wrong, which makes room
-    for them, unless they leapt and the inertial sensor felt nothing; the status warns at once. Detections of a radar
+    for them, unless they leapt and the inertial sensor felt nothing, or repeat a place bit for bit that the body has
+    left; the status warns at once, also of a sensor none of whose messages is of use. Detections of a radar
     and ranges may be of something else, so the filter never yields to those. A radar counts by its Doppler velocities,
     or, as `range`, by its distances from landmarks that its `ids` name.
 
@@ -316,8 +317,10 @@ class EkfFusion(Operator):
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 taken = assumed if clock >= 0 else self._late(sensor)
                 self.state.filter.measure(Measurement(time - taken, sensor, model, noise, clock, taken * 1e-9))
+            self.state.alarms.of_use(name)
         except Unusable as reason:
             self.state.ignored[f"{name}: {reason}"] += 1
+            self.state.alarms.of_no_use(name, str(reason))
 
     def _clock(self, name: str) -> tuple[int, int]:
         """Returns a sensor's clock in the filter, -1 for none, and the offset (ns) that it is believed to have."""
@@ -363,12 +366,18 @@ class EkfFusion(Operator):
         others = {}
         if (count := self.state.filter.hypotheses) > 1:
             others["filter"] = f"{count} headings in question"
+        if self.state.filter.doubted_heading:
+            others["heading"] = "the first heading that was told may be wrong: others explain as much"
         if self.state.filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
         if stamp - self.state.filter.restarted < _ANEW:
             others["filter"] = "begun anew: what was felt and measured of late contradicts the rotation"
         if (found := self.state.filter.suspicion) is not None:
             others |= suspicion_of(*found)
+        if self._lies():
+            others["level"] = (
+                "a base that rolls lies on its side by gravity: axes or extrinsics of the inertial sensor?"
+            )
         if self.state.dropout.lasts(stamp):
             others["inertial sensor"] = "silent: the motion is bridged by what others see"
         if (warnings := self.state.alarms.due(stamp, health, self.state.filter.ignored, self._gates, others)) is None:
@@ -376,6 +385,14 @@ class EkfFusion(Operator):
         warnings |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
         warnings |= unmeasured(self.state.filter.estimate(stamp)[0].covariance)
         return diagnostics(stamp, health, ignored, self._offsets(), warnings)
+
+    def _lies(self) -> bool:
+        """Returns whether a base on wheels is tilted by more than a slope may be, 60 degrees."""
+        assert self.state.filter is not None
+        if self.slip is None and all(s.use != "wheels" for s in self.sensors.values()):
+            return False
+        R_world_body = self.state.filter.estimate(self.state.filter.time)[0].rotation
+        return bool((R_world_body @ self.state.lever_arms.of(self.base_frame)[:3, :3])[2, 2] < 0.5)
 
     def _unheard(self) -> list[tuple[str, str]]:
         return list(unheard(tuple(self.sensors), sorted(self.state.last.streams)).items())

@@ -98,7 +98,7 @@ def diagnostics(
     for name, h in sorted(health.items()):
         silent = h.last_used is None or stamp - h.last_used > 2e9
         if h.doubts and silent:
-            level, text = Level.ERROR, "refused"
+            level, text = Level.ERROR, warnings.get(name, "refused")
         elif name in warnings:
             level, text = Level.WARN, warnings[name]
         elif silent:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from operators.estimation.chi_square import quantile
 from operators.fusion.filter.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
+from operators.fusion.filter.repeats import Repeat
 
 Array = NDArray[np.float64]
 Verdict = Literal["used", "widened", "refused", "unconfirmed"]
@@ -62,7 +63,7 @@ class Health:
 
     `nis`: normalised innovation squared over its degrees of freedom, lately; `nis_sum`, `freedom`: of all used.
     `streak`: refused since one was last believed; `leap`: by how much (m or m/s) they leapt without the inertial
-    sensor feeling it; `room`: when the filter last made room (ns).
+    sensor feeling it; `room`: when the filter last made room (ns); `repeat`: the position that it gives of late.
     """
 
     used: int = 0
@@ -77,11 +78,22 @@ class Health:
     streak: int = 0
     leap: float = 0.0
     room: int | None = None
+    repeat: Repeat | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Returns whether the sensor repeats a position while the body moves."""
+        return self.repeat is not None and self.repeat.speed > 0
+
+    @property
+    def frozen(self) -> bool:
+        """Returns whether the sensor repeats a position that the body has left."""
+        return self.repeat is not None and self.repeat.frozen
 
     @property
     def contradicts(self) -> bool:
         """Returns whether the sensor's measurements were refused too often in a row for chance."""
-        return self.streak >= (2 if self.leap else 3)
+        return self.frozen or self.streak >= (2 if self.leap else 3)
 
     def after(
         self, verdict: Verdict, time: int, nis: float, doubt: Doubt, config: GateConfig, leap: float = 0.0
@@ -92,7 +104,7 @@ class Health:
             smooth = 0.98 * self.nis + 0.02 * nis / freedom
             sums = self.nis_sum + nis, self.freedom + freedom
             counts = self.used + 1, self.widened, self.refused, self.unconfirmed
-            return Health(*counts, time, smooth, (), *sums, room=self.room)
+            return Health(*counts, time, smooth, (), *sums, room=self.room, repeat=self.repeat)
         counted = replace(self, **{verdict: getattr(self, verdict) + 1})
         if verdict == "widened":
             return replace(counted, last_used=time, doubts=(), streak=0, leap=0.0, room=time)
@@ -109,14 +121,24 @@ def threshold(share: float, freedom: int) -> float:
 
 
 def judge(
-    config: GateConfig, doubts: Sequence[Doubt], doubt: Doubt, state: State, H: Array, normalised: float, leapt: bool
+    config: GateConfig,
+    doubts: Sequence[Doubt],
+    doubt: Doubt,
+    state: State,
+    H: Array,
+    normalised: float,
+    never: bool,
+    idle: bool = False,
 ) -> Verdict:
     """Decides about a measurement: `doubt` is what it would be if not believed, `normalised` its NIS.
 
-    `leapt`: refused even where it agrees with those before it, since the inertial sensor contradicts it.
+    `never`: refused even where it agrees with those before it, since the inertial sensor contradicts it; `idle`: it
+    only repeats the one before.
     """
-    if leapt:
+    if never:
         return "refused"
+    if idle:
+        return "unconfirmed"
     fits = normalised <= threshold(config.share, len(doubt.residual))
     known = np.einsum("ij,jk,ik->i", H, state.covariance, H)
     if fits and not (known > config.surplus * doubt.noise.diagonal()).any():

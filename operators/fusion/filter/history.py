@@ -54,8 +54,8 @@ class Hypothesis:
 class Node:
     """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
 
-    `refuted`: measurements contradict what was told of the first heading; `moving`: nanoseconds in motion so far;
-    `window`: what was felt and measured of late.
+    `refuted`: measurements contradict what was told of the first heading; `doubted`: it may be wrong; `moving`:
+    nanoseconds in motion so far; `window`: what was felt and measured of late.
     """
 
     time: int
@@ -65,5 +65,6 @@ class Node:
     health: Mapping[str, Health] = field(default_factory=dict)
     command: Command | None = None
     refuted: bool = False
+    doubted: bool = False
     moving: int = 0
     window: Window = field(default_factory=Window)

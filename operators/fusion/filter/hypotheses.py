@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,8 +13,11 @@ from operators.fusion.filter.history import Hypothesis, Node
 
 _LIKELY = 5.0
 """Logarithm of the ratio of weights beyond which a hypothesis does not count."""
-_DOUBTED = 20_000_000_000
+_FOLLOWED = 20_000_000_000
 """Nanoseconds in motion for which headings are followed against the one told: nothing shows a heading at rest."""
+_DOUBTED, _TRUSTED = 0.03, 0.01
+"""Probability that what was told of the first heading is wrong, from which it is in question, and until which. Headings
+against it begin with 0.01 in all: by Ville's inequality a right one comes into question once in three times at most."""
 
 
 def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
@@ -44,6 +48,14 @@ def refuted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
     return any(h.against for h in (likely(hypotheses) if before else [best]))
 
 
+def doubted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
+    """Returns whether what was told of the first heading is in question; `before`: it was."""
+    best = max(h.weight for h in hypotheses)
+    chances = [(math.exp(h.weight - best), h.against) for h in hypotheses]
+    wrong = sum(chance for chance, against in chances if against) / sum(chance for chance, _ in chances)
+    return wrong > (_TRUSTED if before else _DOUBTED)
+
+
 def combined(hypotheses: Sequence[Hypothesis]) -> State:
     """Returns the likeliest state, with a covariance that holds the others too."""
     best = max(hypotheses, key=lambda h: h.weight)
@@ -69,7 +81,7 @@ def reduced(hypotheses: Sequence[Hypothesis], moving: int) -> tuple[Hypothesis, 
     if len(hypotheses) == 1:
         return (replace(hypotheses[0], weight=0.0),)
     best = max(hypotheses, key=lambda h: h.weight)
-    hypotheses = [h for h in hypotheses if h is best or not (h.against and moving > _DOUBTED)]
+    hypotheses = [h for h in hypotheses if h is best or not (h.against and moving > _FOLLOWED)]
     ordered = sorted(hypotheses, key=lambda h: -h.weight)
     kept: list[Hypothesis] = []
     for h in ordered:

@@ -38,18 +38,19 @@ from operators.fusion.filter.history import (
     Restart,
     Sample,
 )
-from operators.fusion.filter.hypotheses import combined, likely, moves, reduced, refuted, with_errors
+from operators.fusion.filter.hypotheses import combined, doubted, likely, moves, reduced, refuted, with_errors
 from operators.fusion.filter.measurements import Measurement
+from operators.fusion.filter.repeats import repeat_of
 from operators.fusion.filter.sensor_errors import SensorErrors
-from operators.fusion.filter.suspicions import Suspicions
+from operators.fusion.filter.suspicions import CHANCE, Suspicions
 
 Array = NDArray[np.float64]
 TOO_LATE = ": too late"
 """Suffix of a sensor's name in the counts of measurements that came after the window."""
 _STANDS = 60_000_000_000
 """Nanoseconds in motion until which a refuted first heading is reported."""
-_CONTRADICTS = 0.999
-"""Share of rotations that differ less by chance from a fit of the motion of late."""
+_YOUNG = 1e-3
+"""Probability that a filter of less than a window's age differs so much from a fit by chance."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
 
@@ -124,7 +125,16 @@ class LateFilter(Remembered):
 
     @property
     def hypotheses(self) -> int:
-        return len(likely(self._newest().hypotheses))
+        """Returns how many headings are in question: one where it was told, until that is refuted."""
+        node = self._newest()
+        told = any(h.against for h in node.hypotheses) and not node.refuted
+        return 1 if told else len(likely(node.hypotheses))
+
+    @property
+    def doubted_heading(self) -> bool:
+        """Returns whether what was told of the first heading may be wrong, though it is not refuted."""
+        node = self._newest()
+        return node.doubted and not node.refuted
 
     @property
     def refuted_heading(self) -> bool:
@@ -141,6 +151,7 @@ class LateFilter(Remembered):
         """Fits the motion of late anew, once a second: shows errors of sensors, or that the estimate is wrong.
 
         An estimate that was linearised about what it is not may be sure of a wrong rotation: it begins anew at the fit.
+        One that is older than the window holds more than the fit, and is looked at for hours: chance has to be rarer.
         """
         node, before = self._newest(), self.suspicion
         sure = len(likely(node.hypotheses)) == 1 and not node.refuted
@@ -155,7 +166,8 @@ class LateFilter(Remembered):
         off = difference(own, fit.end)[ROTATION]
         late = before is None and self.suspicion is not None  # stamps, which from now on are taken for what they are
         spread = own.covariance[ROTATION, ROTATION] + fit.end.covariance[ROTATION, ROTATION]
-        if late or float(off @ np.linalg.solve(spread, off)) > threshold(_CONTRADICTS, 3):
+        chance = CHANCE if node.window.first else _YOUNG
+        if late or float(off @ np.linalg.solve(spread, off)) > threshold(1 - chance, 3):
             covariance = own.covariance.copy()
             covariance[:SIZE, SIZE:], covariance[SIZE:, :SIZE] = 0.0, 0.0
             covariance[:SIZE, :SIZE] = fit.end.covariance
@@ -304,11 +316,12 @@ class LateFilter(Remembered):
         if not fits and unplaced(state, kind):
             hypotheses = _brought(hypotheses, found)
             found, scores, best = self._found(entry, hypotheses, node)
+        health = replace(health, repeat=repeat_of(health.repeat, entry, state, fits))
         doubt = Doubt(entry.time, residual, entry.noise, kind)
         unfelt = self._config.unfelt
         nis = scores[best][0]
         leapt = 0.0 if unfelt is None else leap(config, entry.sensor, doubt, node.health, state, H, nis, unfelt)
-        verdict = judge(config, health.doubts, doubt, state, H, nis, leapt > 0)
+        verdict = judge(config, health.doubts, doubt, state, H, nis, leapt > 0 or health.frozen, health.idle)
         after = health.after(verdict, entry.time, nis, doubt, config, leapt)
         if verdict == "widened":
             since = (entry.time - (health.last_used or self._nodes[0].time)) * 1e-9
@@ -336,8 +349,14 @@ class LateFilter(Remembered):
             before = combined(node.hypotheses)
             accel = node.accel if self._config.inertial else before.accel_bias
             window = window.measured(entry, before, node.gyro, accel)
-        told_wrongly, healths = refuted(hypotheses, node.refuted), {**node.health, entry.sensor: after}
-        return replace(node, hypotheses=hypotheses, health=healths, refuted=told_wrongly, window=window)
+        return replace(
+            node,
+            hypotheses=hypotheses,
+            health={**node.health, entry.sensor: after},
+            refuted=refuted(hypotheses, node.refuted),
+            doubted=doubted(hypotheses, node.doubted),
+            window=window,
+        )
 
     def _found(
         self, entry: Measurement, hypotheses: Sequence[Hypothesis], node: Node

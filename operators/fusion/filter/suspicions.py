@@ -34,8 +34,9 @@ from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.filter.window import Step, Window, places
 
 Array = NDArray[np.float64]
-_CHANCE = 6e-5
-"""Probability of evidence as strong where nothing is wrong, that of four standard deviations."""
+CHANCE = 6e-5
+"""Probability of evidence as strong where nothing is wrong, that of four standard deviations: a drive of an hour has
+180 windows."""
 _CEASES = 0.25
 """Share of that evidence at which an error that was found no longer counts, and from which one is looked for at all."""
 _EVERY = 1_000_000_000
@@ -118,7 +119,7 @@ class Suspicions(Remembered):
             self._suspected, self._fits, self._found = suspected, [], None
         if not fits:
             return None
-        enough = float(quantile(1 - _CHANCE, len(suspected)))
+        enough = float(quantile(1 - CHANCE, len(suspected)))
         without = self._fitted(window, False)
         if self._found is None and without.promise < _CEASES * enough:  # a second fit is not worth its time
             self._fits = [without]

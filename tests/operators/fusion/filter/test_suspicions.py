@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from operators.fusion.filter.history import Hypothesis, Node, Sample
 from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
-from operators.fusion.filter.suspicions import LATE, SCALE, Suspicions, suspected
+from operators.fusion.filter.suspicions import LATE, SCALE, Fit, Suspicions, suspected
 from operators.fusion.filter.window import Motion, Window
 
 NOISE = Noise(1e-3, 1e-2, 1e-5, 1e-4)
@@ -168,3 +169,20 @@ def test_a_filter_that_is_sure_of_a_wrong_heading_begins_anew_where_the_motion_o
     state = fused.estimate(fused.time)[0]
     off = log_rotation(exp_rotation(np.array([0.0, 0.0, 0.9 * np.sin(0.7 * drive.t[-1])])).T @ state.rotation)
     assert abs(off[2]) < 3 * state.covariance[8, 8] ** 0.5 < 0.3
+
+
+@pytest.mark.parametrize(("old", "off", "restarts"), [(False, 1.0, True), (True, 1.0, False), (True, 1.25, True)])
+def test_a_filter_older_than_the_window_begins_anew_by_stronger_evidence(old: bool, off: float, restarts: bool) -> None:
+    """An hour has 180 windows: one in a thousand differs by 0.95 rad, 60 in a million by 1.1."""
+    ones = State(ZERO, ZERO, np.eye(3), ZERO, ZERO, np.eye(SIZE) * 0.16**2)
+    window = replace(Drive(seconds=26).window(), motion=None)
+    node = Node(0, (Hypothesis(0.0, ones),), ZERO, -DOWN, window=window if old else Window())
+    assert bool(node.window.first) == old
+    fused = LateFilter(FilterConfig(gravity=9.81), node)
+    for k in range(1, 5):
+        fused.feel(Sample(k * 10**8, ZERO, -DOWN, NOISE))
+    end = replace(ones, rotation=exp_rotation(np.array([0.0, 0.0, off])))
+    fit = Fit(0, ones, np.zeros(0), until=4 * 10**8, end=end)
+    fused._suspicions = SimpleNamespace(look=lambda *_: fit, found=None)  # type: ignore[assignment]
+    fused.look()
+    assert (fused.restarted == 4 * 10**8) == restarts
