@@ -86,6 +86,16 @@ def test_names_may_be_added_while_it_runs_and_keep_their_numbers(named: str) -> 
     assert made.process(IMAGE).digest() == after.digest()
 
 
+@pytest.mark.parametrize("classes", ["red, blue,", "red,,blue", ",", "red, red", ""])
+def test_an_empty_name_or_one_given_twice_is_refused(named: str, classes: str) -> None:
+    with pytest.raises(ModelError, match="names a class twice or has an empty name"):
+        detector(model=named, classes=classes)
+    made = detector(model=named, classes="red")
+    with pytest.raises(ParameterError, match="names a class twice or has an empty name"):
+        made.set_parameter("classes", classes)
+    assert made.process(IMAGE).class_names == ("red",)
+
+
 def test_without_names_or_a_tokenizer_it_is_refused(named: str, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"give names in OnnxDetector\.classes \(`mug, fire extinguisher`\)"):
         detector(model=named)
