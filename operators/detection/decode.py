@@ -49,6 +49,7 @@ class Layout:
     - `draw` draws the masks of candidates that have any.
     - `sized`: the network has a second input, the (width, height) of the image in whose pixels its boxes are.
     - `words`: tokens of each class's name that the network takes besides, for an open vocabulary; 0 for none.
+    - `names`: of the outputs that are decoded, in their order, where an export has them all; else its own order counts.
     """
 
     decode: Decode
@@ -61,6 +62,7 @@ class Layout:
     draw: Draw | None = None
     sized: bool = False
     words: int = 0
+    names: tuple[str, ...] = ()
 
 
 def best_class(

@@ -146,7 +146,7 @@ def _download(model: Model, part: Path, progress: Progress) -> None:
         except urllib.error.HTTPError as error:
             if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
                 raise FetchError(f"{model.source.url} answers {error.code} {error.reason}. {missing(model)}") from None
-            if anew:  # all that there is: its digest tells what it is
+            if anew:  # all that there is: of another digest, or right
                 return
             part.unlink(missing_ok=True)  # longer than the file, or all of a shorter one
             anew = True

@@ -72,6 +72,14 @@ def test_it_finds_what_is_named_as_its_authors_read_the_outputs(named: str) -> N
     np.testing.assert_allclose(message.boxes, corners, atol=1e-3)
 
 
+def test_the_mask_of_the_names_may_be_its_first_input(named: str, tmp_path: Path) -> None:
+    expected = detector(model=named, classes="red, blue").process(IMAGE).digest()
+    write_open_detector(
+        tmp_path / "cache" / "open.onnx", tmp_path / "cache" / "open.tokenizer.txt", BOXES, COLORS, mask_first=True
+    )
+    assert detector(model=named, classes="red, blue").process(IMAGE).digest() == expected
+
+
 def test_names_may_be_added_while_it_runs_and_keep_their_numbers(named: str) -> None:
     made = detector(model=named, classes="red, blue")
     before = made.process(IMAGE)
