@@ -21,6 +21,7 @@ Box = tuple[Array, Array, float]
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
 _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
+_CALIBRATED = np.radians(0.3)  # and by such an angle, since cameras are not calibrated better
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
 _TAIL_FLAT, _TAIL_ROUND = 1.4, 0.8  # and those of single views, on flat sides and on round ones, which recede
@@ -105,7 +106,8 @@ def fit_cuboid(
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
+    focal = np.linalg.norm(np.cross(P[0, :, :3], P[2, :, :3]), axis=1)[:, None]  # of views whose third row has length 1
+    weights = edges / (np.hypot(_PIXELS, _CALIBRATED * focal) + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
 
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
