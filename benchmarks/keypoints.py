@@ -4,8 +4,8 @@
         --set keypoints=MODEL --set keypoints.decoder=movenet --record RECORDING
     python benchmarks/keypoints.py RECORDING MODEL
 
-Prints the largest distance of a point from that of the network called directly, with a crop of its own, and how often
-SkeletonPosture takes the people for standing and for sitting.
+Prints the largest distance of a point from that of the network called directly on a crop that is cut here, and how
+often SkeletonPosture takes the people for standing and for sitting.
 """
 
 from __future__ import annotations

@@ -106,8 +106,7 @@ def fit_cuboid(
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    focal = np.linalg.norm(np.cross(P[0, :, :3], P[2, :, :3]), axis=1)[:, None]  # of views whose third row has length 1
-    weights = edges / (np.hypot(_PIXELS, _CALIBRATED * focal) + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
+    weights = edges / (_stray(P) + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
 
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
@@ -200,6 +199,12 @@ def _starts(start: Box, eyes: Array, logs: Array) -> Array:
     rows[:, :3], rows[:, 3:6], rows[:, 6] = center, np.log(sizes), yaw
     rows[:, :2] += axes[deep] * np.sign(along[deep]) * lack[:, None] / 2
     return rows
+
+
+def _stray(P: Array) -> Array:
+    """Returns by how many pixels (V, 1) edges stray in views (3, V, 4), whatever the size of the box."""
+    focal = np.linalg.norm(np.cross(P[0, :, :3], P[2, :, :3]), axis=1)  # the third row turns only
+    return np.asarray(np.hypot(_PIXELS, _CALIBRATED * focal)[:, None])
 
 
 def _surface(rows: Array, places: Array, count: int, cut: int, noise: float, inset: float) -> Array:
