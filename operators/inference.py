@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from operators.protobuf import field
 
@@ -16,8 +18,7 @@ class ModelError(ValueError):
     """A model file that does not fit its use: names the file, what it has and what would be right."""
 
 
-Provider = Literal["cpu", "cuda", "tensorrt", "openvino", "rocm", "qnn", "coreml"]
-_PROVIDERS: dict[Provider, str] = {
+_PROVIDERS = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
@@ -28,6 +29,9 @@ _PROVIDERS: dict[Provider, str] = {
 }
 """onnxruntime's names. All but the first come with builds of it for those devices."""
 
+Provider = Annotated[str, Field(pattern=rf"^({'|'.join(_PROVIDERS)}|(cuda|tensorrt|rocm):\d+)$")]
+"""One of these; of several cards one by its number: `cuda:1`."""
+
 
 def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] = ()) -> onnxruntime.InferenceSession:
     """Opens an ONNX model, for one thread on the CPU. Inner values that `reveal` names follow its own outputs.
@@ -37,11 +41,11 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
     """
     import onnxruntime  # heavy, and needed only where a network runs
 
-    available = onnxruntime.get_available_providers()
-    if _PROVIDERS[provider] not in available:
+    available, wanted = onnxruntime.get_available_providers(), provider.partition(":")[0]
+    if _PROVIDERS[wanted] not in available:
         names = [name for name, full in _PROVIDERS.items() if full in available]
         raise ModelError(
-            f"this onnxruntime has no provider {provider!r}; it has {', '.join(names)} (other builds: onnxruntime-gpu, "
+            f"this onnxruntime has no provider {wanted!r}; it has {', '.join(names)} (other builds: onnxruntime-gpu, "
             f"onnxruntime-openvino, onnxruntime-qnn)"
         )
 
@@ -72,7 +76,9 @@ def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.In
         session = onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # onnxruntime's exception classes share no public base
         raise ModelError(f"{told} cannot be loaded as an ONNX model: {error}") from error
-    if _PROVIDERS[provider] not in session.get_providers():  # it only logs this, and takes the next one
+    if (
+        _PROVIDERS[provider.partition(":")[0]] not in session.get_providers()
+    ):  # it only logs this, and takes the next one
         raise ModelError(
             f"onnxruntime's provider {provider!r} could not start: is there such a device, and are its driver and "
             f"libraries installed? On this machine provider: cpu runs {told}"
@@ -80,10 +86,18 @@ def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.In
     return session
 
 
-def _chosen(provider: Provider, available: Sequence[str]) -> list[str]:
-    """The provider, and others for the layers that it does not know: for TensorRT CUDA first, then the CPU."""
-    cuda = (_PROVIDERS["cuda"],) if provider == "tensorrt" and _PROVIDERS["cuda"] in available else ()
-    return list(dict.fromkeys((_PROVIDERS[provider], *cuda, _PROVIDERS["cpu"])))
+def _chosen(provider: Provider, available: Sequence[str]) -> list[str | tuple[str, dict[str, Any]]]:
+    """The provider, and others for the layers that it does not know: for TensorRT CUDA first, then the CPU.
+
+    Those of cards get the number of the card where one is given.
+    """
+    name, _, number = provider.partition(":")
+    cuda = ("cuda",) if name == "tensorrt" and _PROVIDERS["cuda"] in available else ()
+    card: dict[str, Any] = {"device_id": int(number)} if number else {}
+    cards: list[str | tuple[str, dict[str, Any]]] = [
+        (_PROVIDERS[each], card) if card else _PROVIDERS[each] for each in (name, *cuda) if each != "cpu"
+    ]
+    return [*cards, _PROVIDERS["cpu"]]
 
 
 def _outputs(names: Sequence[str]) -> bytes:

@@ -33,6 +33,8 @@ _TYPES: dict[str, type[np.generic]] = {
     "tensor(uint8)": np.uint8,
     "tensor(int32)": np.int32,
 }
+NUMBERS: Mapping[str, type[np.generic]] = {**_TYPES, "tensor(int64)": np.int64}
+"""Types of numbers that a network takes, by onnxruntime's names of their tensors."""
 _COLORED = re.compile(r"(?P<name>.*?\S)\s+(?P<red>\d{1,3})[\s,]+(?P<green>\d{1,3})[\s,]+(?P<blue>\d{1,3})")
 
 

@@ -101,6 +101,25 @@ class Transforms(Message):
             rotations=rotation[None],
         )
 
+    @classmethod
+    def level_camera(
+        cls,
+        height: float,
+        pitch: float = 0.0,
+        *,
+        stamp: int = MISSING,
+        frame: str = "base_link",
+        child_frame: str = "camera",
+    ) -> Self:
+        """One transform: that of a camera, `height` metres above a level base's ground and not rolled.
+
+        `pitch`, in radians, is how far it looks down; one that looks up has a negative one. `child_frame` is its
+        optical frame.
+        """
+        c, s = np.cos(pitch), np.sin(pitch)
+        matrix = np.array([[0, -s, c, 0], [-1, 0, 0, 0], [0, -c, -s, height], [0, 0, 0, 1]])
+        return cls.from_matrix(matrix, stamp=stamp, frame=frame, child_frame=child_frame)
+
     @property
     def count(self) -> int:
         """Number of transforms."""

@@ -47,8 +47,10 @@ class CameraMount(Operator):
     The vertical comes from the level and upright surfaces of a view, and from the accelerometer where there is one; the
     ground is the lowest level surface, of that view or one before. The first view that shows the vertical without doubt
     decides, for the map's frame begins with it; after `patience` the best one so far does, with a warning. The base is
-    level where the camera's odometry began. Extrinsics that hold the base are passed on as they are; where the first
-    view that shows the vertical without doubt is far off them, a warning and the finding at the run's end state it.
+    level where the camera's odometry began. A camera on its side or upside down looks like one that is not where floor
+    and walls are square: it needs an accelerometer, or a given base. Extrinsics that hold the base are passed on as
+    they are; where the first view that shows the vertical without doubt is far off them, a warning and the finding at
+    the run's end state it.
 
     Method: directions of surfaces as in Coughlan and Yuille, "Manhattan world", 1999.
     """
@@ -112,10 +114,12 @@ class CameraMount(Operator):
         text = f"{self.base_frame} is given"
         if found is None:
             text += "; few surfaces show whether it is right"
-        elif np.arccos(np.clip(given @ found.up, -1, 1)) > _WRONG:
+        elif (off := float(np.arccos(np.clip(given @ found.up, -1, 1)))) > _WRONG:
+            aside = min(abs(off - np.pi / 2), np.pi - off) < _WRONG  # walls and floor look alike then
             text = self.state.finding = (
                 f"by the given {self.base_frame} the camera looks {_look(given)}, by the surfaces in sight "
-                f"{_look(found.up)}: the extrinsics are wrong; without {self.base_frame} in them it is found"
+                f"{_look(found.up)}: {'if it is not mounted on its side or upside down, ' if aside else ''}the "
+                f"extrinsics are wrong; without {self.base_frame} in them it is found"
             )
         level = Level.WARN if self.state.finding else Level.OK
         return {"status": counted_status("camera_mount", cloud.stamp, text, level, {})}

@@ -50,6 +50,7 @@ class Layout:
     - `sized`: the network has a second input, the (width, height) of the image in whose pixels its boxes are.
     - `grid`: cells of its coarsest grid, in pixels.
     - `words`: tokens of each class's name that the network takes besides, for an open vocabulary; 0 for none.
+    - `names`: of the outputs that are decoded, in their order, where an export has them all; else its own order counts.
     """
 
     decode: Decode
@@ -63,6 +64,7 @@ class Layout:
     sized: bool = False
     grid: int = 32
     words: int = 0
+    names: tuple[str, ...] = ()
 
 
 def best_class(

@@ -16,6 +16,7 @@ from operators.detection.suppressed import (
     decode_tensorflow,
     decode_torchvision,
     detr_pair,
+    ssd_pair,
 )
 from operators.detection.yolo import (
     decode_fastestdet,
@@ -49,7 +50,13 @@ _MEAN, _DEVIATION = NORMALIZATIONS["imagenet"]
 
 LAYOUTS: dict[DecoderName, Layout] = {
     "fastestdet": Layout(decode_fastestdet, bgr=True, fit="stretch", classes=lambda o: int(o[0].shape[1]) - 5),
-    "yolov5": Layout(decode_yolov5, bgr=False, fit="letterbox", classes=lambda o: int(o[0].shape[2]) - 5),
+    "yolov5": Layout(
+        decode_yolov5,
+        bgr=False,
+        fit="letterbox",
+        classes=lambda o: int(o[0].shape[2]) - 5 - prototypes_in(o),
+        draw=by_prototypes,
+    ),
     "yolov8": Layout(
         decode_yolov8,
         bgr=False,
@@ -72,12 +79,20 @@ LAYOUTS: dict[DecoderName, Layout] = {
         decode_ssd,
         bgr=False,
         fit="stretch",
-        classes=lambda o: int(next(a.shape[2] for a in o if a.shape[2] != 4)) - 1,
+        classes=lambda o: int(ssd_pair(o)[0].shape[1]) - 1,
         mean=(127.0, 127.0, 127.0),
         scale=(128.0, 128.0, 128.0),
     ),
     "end2end": Layout(decode_end2end, bgr=False, fit="letterbox", classes=None, nms_iou=1.0, draw=by_prototypes),
-    "rtdetr": Layout(decode_rtdetr, bgr=False, fit="stretch", classes=None, nms_iou=1.0, sized=True),
+    "rtdetr": Layout(
+        decode_rtdetr,
+        bgr=False,
+        fit="stretch",
+        classes=None,
+        nms_iou=1.0,
+        sized=True,
+        names=("labels", "boxes", "scores"),
+    ),
     "detr": Layout(
         decode_detr,
         bgr=False,
@@ -105,10 +120,19 @@ LAYOUTS: dict[DecoderName, Layout] = {
         scale=_CLIP[1],
         nms_iou=1.0,
         words=16,
+        names=("logits", "pred_boxes"),
     ),
     "torchvision": Layout(
         decode_torchvision, bgr=False, fit="stretch", classes=None, nms_iou=1.0, draw=by_probabilities
     ),
-    "tensorflow": Layout(decode_tensorflow, bgr=False, fit="stretch", classes=None, scale=_ONE, nms_iou=1.0),
+    "tensorflow": Layout(
+        decode_tensorflow,
+        bgr=False,
+        fit="stretch",
+        classes=None,
+        scale=_ONE,
+        nms_iou=1.0,
+        names=("detection_boxes", "detection_classes", "detection_scores"),
+    ),
 }
 """Input, outputs and suppression of each family."""

@@ -19,7 +19,7 @@ from operators.image.letterbox import Fit, FitMode
 from operators.inference import ModelError, Provider, open_content, open_session
 from operators.language.bpe import Tokenizer
 from operators.model_metadata import told
-from operators.network_input import ImageInput, image_input
+from operators.network_input import NUMBERS, ImageInput, image_input
 
 _PROMPT = "a photo of a {}"
 _SIDE = 640  # pixels, where the model leaves it open
@@ -48,11 +48,12 @@ class ExportedFinder:
         self._layout: Layout = LAYOUTS[decoder]
         self._session = open_session(file, provider)
         self._input = self._image_input(side)
+        self._apart = self._answers_by_image()
         self._opened = side is not None and self._input.size != (side, side)
         if self._opened and side is not None:
             self._open_input(side, provider)
         self._feed = self._size_input() if self._layout.sized else {}
-        self._batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
+        self._names = self._ordered()
         self._fit: FitMode = self._layout.fit if fit is None else fit
         self._masks = masks and self._layout.draw is not None
         labels = told(file, self._session.get_modelmeta().custom_metadata_map).labels if names is None else None
@@ -88,7 +89,7 @@ class ExportedFinder:
         try:
             feed = self._size_input() if self._layout.sized else {}
             nothing = self._input.tensor(np.zeros((side, side, 3), np.uint8))
-            outputs = self._session.run(None, {exported.name: nothing, **feed})
+            outputs = self._session.run(self._ordered(), {exported.name: nothing, **feed})
             self._layout.decode(outputs, self._input.size, 1.0)
         except Exception as error:  # onnxruntime's exception classes share no public base
             raise ModelError(
@@ -104,6 +105,7 @@ class ExportedFinder:
     def find_also(self, names: Sequence[str]) -> None:
         """Adds names to those that a network with an open vocabulary finds. Raises ModelError for other networks."""
         beside = [each for each in self._session.get_inputs() if each.name != self._input.name]
+        beside.sort(key=lambda each: "mask" in each.name)  # stable: the tokens first
         if self._tokenizer is None or not beside or any(each.type != "tensor(int64)" for each in beside):
             described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in beside)
             raise ModelError(f"{self._file} must take tokens of names and a mask, int64 [C, L]; it takes {described}")
@@ -148,9 +150,9 @@ class ExportedFinder:
         """Returns the outputs for each image, with a batch axis of 1."""
         count = len(tensors)
         alike = len({each.shape for each in tensors}) == 1
-        at_once = count > 1 and alike and not self._feed and not isinstance(self._batch, int)
+        at_once = count > 1 and alike and not self._feed and self._apart
         batches = [np.concatenate(tensors)] if at_once else tensors
-        runs = [self._session.run(None, {self._input.name: batch, **self._feed}) for batch in batches]
+        runs = [self._session.run(self._names, {self._input.name: batch, **self._feed}) for batch in batches]
         answers = [[a.astype(np.float32) if a.dtype == np.float16 else a for a in map(np.asarray, r)] for r in runs]
         if not at_once:
             return list(answers)
@@ -161,6 +163,22 @@ class ExportedFinder:
                 f"export it for one image at a time"
             )
         return [[a[k : k + 1] for a in answers[0]] for k in range(count)]
+
+    def _answers_by_image(self) -> bool:
+        """Returns whether a batch goes in and each output has the batch's own extent first.
+
+        Rows of all images in one list (N, 7) do not, whatever their export calls N.
+        """
+        outputs = [each.shape for each in self._session.get_outputs()]
+        batch = next(each.shape[0] for each in self._session.get_inputs() if each.name == self._input.name)
+        listed = len(outputs) == 1 and len(outputs[0]) == 2
+        return isinstance(batch, str) and not listed and all(shape and shape[0] == batch for shape in outputs)
+
+    def _ordered(self) -> list[str] | None:
+        """Returns the names of the outputs in the decoder's order; None for the export's own."""
+        found = {each.name.split(":")[0]: each.name for each in self._session.get_outputs()}
+        known = [found[name] for name in self._layout.names if name in found]
+        return known if known and len(known) == len(self._layout.names) else None
 
     def _read(self, outputs: Outputs, fit: Fit, threshold: float, nms_iou: float, most: int) -> Candidates:
         try:
@@ -176,16 +194,15 @@ class ExportedFinder:
 
     def _size_input(self) -> dict[str, NDArray[Any]]:
         """Returns what the second input of a `sized` network is given: (width, height) of the first."""
-        beside = self._session.get_inputs()[1:]
+        beside = [each for each in self._session.get_inputs() if each.name != self._input.name]
         if not beside:
             return {}
-        if beside[0].type not in ("tensor(int64)", "tensor(float)"):
+        if beside[0].type not in NUMBERS:
             raise ModelError(
-                f"{self._file}: its second input must be the size of the image, tensor(int64) or tensor(float) [1, 2], "
-                f"is {beside[0].name} {beside[0].type} {beside[0].shape}"
+                f"{self._file}: its second input must be the size of the image, {' or '.join(NUMBERS)} [1, 2], is "
+                f"{beside[0].name} {beside[0].type} {beside[0].shape}"
             )
-        kind = np.int64 if beside[0].type == "tensor(int64)" else np.float32
-        return {beside[0].name: np.array([self._input.size], kind)}
+        return {beside[0].name: np.array([self._input.size], NUMBERS[beside[0].type])}
 
     def _check_classes(self, outputs: Outputs, found: Candidates) -> None:
         known = self._layout.classes

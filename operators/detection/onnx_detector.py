@@ -98,7 +98,10 @@ class _OnnxDetection(Operator, abstract=True):
         known, finder = self._finder.names, self._finder
         if not (isinstance(finder, ExportedFinder) and finder.is_open):
             raise ParameterError(f"{self.model} finds the {len(known)} classes that it was trained for, and no others")
-        names = known if self.classes is None else self._names(self.classes)
+        try:
+            names = known if self.classes is None else self._names(self.classes)
+        except ModelError as error:
+            raise ParameterError(str(error)) from None
         if names[: len(known)] != known:
             raise ParameterError(f"names may be added, after those before: {', '.join(known)}")
         finder.find_also(names[len(known) :])
@@ -141,8 +144,11 @@ class _OnnxDetection(Operator, abstract=True):
 
     def _names(self, classes: str) -> tuple[str, ...]:
         names = tuple(name.strip() for name in classes.split(","))
-        file = Path(classes).is_file() or (len(names) == 1 and bool(Path(classes).suffix))
-        return read_labels(self.use_file(classes)).names if file else names
+        if Path(classes).is_file() or (len(names) == 1 and bool(Path(classes).suffix)):
+            return read_labels(self.use_file(classes)).names
+        if "" in names or len(set(names)) < len(names):
+            raise ModelError(f"OnnxDetector.classes={classes!r} names a class twice or has an empty name")
+        return names
 
     def _described(self, used: Used, decoder: str) -> str:
         count = len(self._finder.names)

@@ -125,11 +125,10 @@ def decode_torchvision(outputs: Outputs, size: Size, threshold: float) -> Candid
 def decode_ssd(outputs: Outputs, size: Size, threshold: float) -> Candidates:
     """SSD as exported before its suppression: scores (1, N, 1 + C), class 0 the background, and boxes (1, N, 4).
 
-    Boxes are corners as shares of the input. A prior may answer for several classes. The outputs come in either order.
+    Boxes are corners as shares of the input. A prior may answer for several classes. The outputs come in either order;
+    of three classes the scores come first.
     """
-    if len(outputs) != 2 or any(o.ndim != 3 or o.shape[0] != 1 for o in outputs) or not _ssd_pair(*outputs):
-        raise ValueError(f"an SSD's outputs have shapes (1, N, 1 + classes) and (1, N, 4), got {shapes_of(outputs)}")
-    scores, boxes = sorted((o[0] for o in outputs), key=lambda o: o.shape[1] == 4)
+    scores, boxes = ssd_pair(outputs)
     priors, classes = np.nonzero(scores[:, 1:] >= threshold)
     made = boxes[priors] * np.array([*size, *size], np.float32)
     return _kept(made, scores[priors, classes + 1], classes, threshold)
@@ -149,8 +148,13 @@ def decode_tensorflow(outputs: Outputs, size: Size, threshold: float) -> Candida
     return _kept(boxes, outputs[2].reshape(-1), outputs[1].reshape(-1), threshold)
 
 
-def _ssd_pair(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    return bool(a.shape[1] == b.shape[1] and (a.shape[2] == 4) != (b.shape[2] == 4))
+def ssd_pair(outputs: Outputs) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Returns scores (N, 1 + C) and boxes (N, 4) of an SSD. Raises ValueError for other outputs."""
+    flat = [o[0] for o in outputs if o.ndim == 3 and o.shape[0] == 1]
+    if len(outputs) != 2 or len(flat) != 2 or len(flat[0]) != len(flat[1]) or 4 not in [o.shape[1] for o in flat]:
+        raise ValueError(f"an SSD's outputs have shapes (1, N, 1 + classes) and (1, N, 4), got {shapes_of(outputs)}")
+    first, second = flat
+    return (first, second) if second.shape[1] == 4 else (second, first)
 
 
 def _kept(
@@ -160,6 +164,6 @@ def _kept(
     threshold: float,
     masks: NDArray[Any] | None = None,
 ) -> Candidates:
-    keep = np.flatnonzero(scores >= threshold)
+    keep = np.flatnonzero((scores >= threshold) & (classes >= 0))  # exports fill up rows with a class of -1
     made = boxes[keep].astype(np.float32), scores[keep].astype(np.float32), classes[keep].astype(np.int32)
     return Candidates(*made, None if masks is None else masks[keep].astype(np.float32))

@@ -39,12 +39,16 @@ def decode_fastestdet(outputs: Outputs, size: Size, threshold: float) -> Candida
 
 
 def decode_yolov5(outputs: Outputs, size: Size, threshold: float) -> Candidates:
-    """YOLOv5 to v7 as exported: (1, N, 5 + C), centre and size in input pixels, objectness, class scores."""
-    output = outputs[0]
-    if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] < 6:
-        raise ValueError(f"a YOLOv5 output has shape (1, N, 5 + classes), got {output.shape}")
+    """YOLOv5 to v7 as exported: (1, N, 5 + C), centre and size in input pixels, objectness, class scores.
+
+    A model of the task segment has prototypes (1, K, h, w) as a second output, and K coefficients behind the scores.
+    """
+    output, kinds = outputs[0], prototypes_in(outputs)
+    if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] < 6 + kinds:
+        raise ValueError(f"a YOLOv5 output has shape (1, N, 5 + classes + coefficients), got {shapes_of(outputs)}")
     rows = output[0]
-    return best_class(rows[:, :4], rows[:, 5:] * rows[:, 4:5], threshold)
+    end = rows.shape[1] - kinds
+    return best_class(rows[:, :4], rows[:, 5:end] * rows[:, 4:5], threshold, rows[:, end:] if kinds else None)
 
 
 def decode_yolov8(outputs: Outputs, size: Size, threshold: float) -> Candidates:

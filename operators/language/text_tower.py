@@ -18,14 +18,14 @@ _TYPES = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
 class TextTower:
     """Turns texts into unit vectors of the space of its network's images.
 
-    The first input takes tokens (N, L) of int64 or int32, a second one whether each counts. Raises FileNotFoundError,
-    or ModelError for a network of other inputs or outputs, or a tokenizer that is none.
+    The first input takes tokens (N, L) of int64 or int32, a second one, or one named a mask, whether each counts.
+    Raises FileNotFoundError, or ModelError for a network of other inputs or outputs, or a tokenizer that is none.
     """
 
     def __init__(self, file: Path, tokenizer: Path, provider: Provider = "cpu") -> None:
         self._tokenizer = Tokenizer(tokenizer)
         self._session = open_session(file, provider)
-        self._inputs = self._session.get_inputs()
+        self._inputs = sorted(self._session.get_inputs(), key=lambda each: "mask" in each.name)  # stable
         fits = 1 <= len(self._inputs) <= 2 and all(i.type in _TYPES and len(i.shape) == 2 for i in self._inputs)
         if not fits:
             described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in self._inputs)

@@ -136,7 +136,7 @@ def _alone(lock: Path, model: Model) -> Iterator[None]:
 def _download(model: Model, part: Path, progress: Progress) -> None:
     """Appends to the part until it has all bytes. A connection that breaks off is made anew."""
     assert model.source.url is not None
-    idle, end = 0, time.monotonic() + MOST_TIME
+    idle, end, anew = 0, time.monotonic() + MOST_TIME, False
     while idle < TRIES:
         before = _size(part)
         reason: object = "the connection ended early"
@@ -146,7 +146,10 @@ def _download(model: Model, part: Path, progress: Progress) -> None:
         except urllib.error.HTTPError as error:
             if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
                 raise FetchError(f"{model.source.url} answers {error.code} {error.reason}. {missing(model)}") from None
-            part.unlink(missing_ok=True)  # longer than the file
+            if anew:  # all that there is: of another digest, or right
+                return
+            part.unlink(missing_ok=True)  # longer than the file, or all of a shorter one
+            anew = True
         except (OSError, http.client.HTTPException) as error:
             reason = getattr(error, "reason", error)
         idle = 0 if _size(part) > before else idle + 1
@@ -173,14 +176,15 @@ def _receive(url: str, part: Path, before: int, size: int | None, progress: Prog
         resumed = begins is not None and int(begins[1]) == before
         have = before if resumed else 0
         length = answer.headers.get("Content-Length")
-        whole = size if size is not None else None if length is None else have + int(length)
+        there = None if length is None else have + int(length)
+        whole = there if size is None else size
         most = MOST if whole is None else whole
         with part.open("ab" if resumed else "wb") as handle:
             progress(have, whole)
             while have <= most and time.monotonic() <= end:
                 piece = answer.read1(min(_PIECE, most + 1 - have))
                 if not piece:
-                    return whole is None or have >= whole
+                    return whole is None or have >= whole or have == there  # a shorter file is another one
                 handle.write(piece)
                 have += len(piece)
                 progress(have, whole)

@@ -19,6 +19,7 @@ from dataflow.messages import (
     Message,
     Odometry,
     PointCloud,
+    SceneGraph,
     Transforms,
     Twist,
 )
@@ -98,7 +99,7 @@ class PerceptionSystem:
         infos = {"image": image_info, "depth": depth_info}
         named = [name for name, info in infos.items() if info is not None] if sensors is None else list(sensors)
         self.sensors = tuple(name for name in SENSORS if name in named)
-        _check_sensors(named, infos, extrinsics)
+        _check_sensors(named, infos, extrinsics, mounted=bool(params.get("mount")))
         self._infos, self._lidar_frame = infos, lidar_frame
         static: dict[str, Message | None] = {
             **{f"{n}_info": info for n, info in infos.items()},
@@ -122,6 +123,12 @@ class PerceptionSystem:
             overwrite=overwrite,
         )
         self._last: int | None = None
+        self._graph: SceneGraph | None = None
+
+    @property
+    def graph(self) -> SceneGraph | None:
+        """The newest scene graph of all steps; None before the first."""
+        return self._graph
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -169,6 +176,7 @@ class PerceptionSystem:
         status: dict[str, Any] = {
             name.removesuffix("/status"): found[-1] for name, found in made.items() if name.endswith("/status")
         }
+        self._graph = newest.get("graph", self._graph)
         poses: Any = tuple(made.get("odometry", ()))
         return PerceptionResult(stamp=stamp, poses=poses, status=status, **newest)
 
@@ -203,7 +211,10 @@ class PerceptionSystem:
         self._session.__exit__(kind, error, trace)
 
 
-def _check_sensors(named: Sequence[str], infos: Mapping[str, CameraInfo | None], extrinsics: Transforms | None) -> None:
+def _check_sensors(
+    named: Sequence[str], infos: Mapping[str, CameraInfo | None], extrinsics: Transforms | None, *, mounted: bool
+) -> None:
+    """Raises ValueError for what is lacking; a camera alone whose base is found (`mounted`) needs no extrinsics."""
     if unknown := [name for name in named if name not in SENSORS]:
         raise ValueError(f"no sensor {unknown[0]!r}: there are {', '.join(SENSORS)}")
     if not named:
@@ -213,9 +224,14 @@ def _check_sensors(named: Sequence[str], infos: Mapping[str, CameraInfo | None],
         raise ValueError("depth needs its calibration: depth_info")
     if "image" in named and space and infos["image"] is None:
         raise ValueError(f"image with {' and '.join(space)} needs its calibration: image_info")
-    if extrinsics is None and (space or "imu" in named):
+    frames = {info.frame for info in infos.values() if info is not None}
+    alone = mounted and set(named) <= {"image", "depth"} and len(frames) == 1
+    if extrinsics is None and (space or "imu" in named) and not alone:
         lacking = " and ".join((*space, *(("imu",) if "imu" in named else ())))
-        raise ValueError(f"{lacking}: extrinsics must say where the sensors are on the robot")
+        raise ValueError(
+            f"{lacking}: extrinsics must say where the sensors are on the robot, such as Transforms.level_camera("
+            f"height, pitch); for image and depth of one frame mount=True finds it"
+        )
 
 
 def _believed(sensors: Sequence[str], given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.labels import LabelSpace
+from operators.labels import LabelSpace, SizePrior
 
 Array = NDArray[np.float64]
 _STILL = np.zeros(3)
@@ -22,7 +22,8 @@ _STILL.flags.writeable = False
 class Body:
     """A node: centre (3,), full size (3,) and heading of its upright box, velocity (3,), m/s, roles of its class.
 
-    `moving` is the probability that it moves, NaN where that is to be found from its places.
+    `usual` are the usual sizes of its class. `moving` is the probability that it moves, NaN where that is to be found
+    from its places.
     """
 
     id: int
@@ -33,6 +34,7 @@ class Body:
     velocity: Array
     roles: frozenset[str] = frozenset()
     moving: float = math.nan
+    usual: tuple[SizePrior, ...] = ()
 
     @property
     def agent(self) -> bool:
@@ -75,6 +77,17 @@ class Body:
         """The corners (4, 2) as OpenCV takes them."""
         return self._corners.astype(np.float32)
 
+    def hidden_foot(self, ground: float) -> float:
+        """Returns how surely it stands on ground at this height, m, and what is seen of it is no whole one.
+
+        That is so where it is as high as such things are if it stands there, and far from that as it is seen, such as
+        the back of a chair behind a table. 0 for classes of which no foot is hidden; of those that also stand elsewhere
+        (small plants) what is seen may be a part of such a one.
+        """
+        foot = [each for each in self.usual if each.foot]
+        seen = max((_likeness(each, self.top - self.bottom, part=not each.foot) for each in self.usual), default=0.0)
+        return max((_likeness(each, self.top - ground) for each in foot), default=0.0) * (1 - seen)
+
     def corners(self) -> Array:
         """Returns the four corners (4, 2) of the footprint, counter-clockwise."""
         return self._corners
@@ -103,11 +116,19 @@ class BodyMemory:
             box = rows[k].tobytes()
             known = before.get(id)
             if known is None or known[:2] != (label, box):
-                roles = self._labels.roles(label)
-                body = Body(id, label, centers[k].copy(), sizes[k].copy(), float(yaws[k]), _STILL, roles)
+                roles, usual = self._labels.roles(label), self._labels.sizes(label)
+                box_of = centers[k].copy(), sizes[k].copy(), float(yaws[k])
+                body = Body(id, label, *box_of, _STILL, roles, usual=usual)
                 known = (label, box, body)
             self._known[id] = known
         return [body for _, _, body in self._known.values()]
+
+
+def _likeness(usual: SizePrior, height: float, *, part: bool = False) -> float:
+    """Returns the likelihood of a height, m, relative to the usual one's own; with `part` a lower one is as likely."""
+    if height <= 0 or (part and height < usual.size[2]):
+        return float(height > 0)
+    return math.exp(-0.5 * (math.log(height / usual.size[2]) / usual.spread[2]) ** 2)
 
 
 def footprint_share(first: Body, second: Body) -> float:

@@ -123,7 +123,8 @@ def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> lis
         means = [n for n in known if n.endswith("/means") and n.startswith(f"{room}/" if room else "")]
         if len(means) != 1:
             found = f"there are several of embeddings: {', '.join(means)}" if means else "nodes have no embeddings"
-            raise QueryError(f"{reason}. By meaning it cannot be asked: {found}; {how_to_embed()}")
+            asked = reason if reason.endswith("?") else f"{reason}."
+            raise QueryError(f"{asked} By meaning it cannot be asked: {found}; {how_to_embed()}")
         records = recording.messages(means, end=graph.stamp)
         vectors = (record.message for record in records if isinstance(record.message, FeatureVector))
         matches = by_meaning(graph, vectors, query)[:_LIKEST]

@@ -98,9 +98,10 @@ def relations_of(
     sitting = {s for s, p, _ in found if p == "sitting_on"}
     for body in things:
         if body.id not in held and body.id not in sitting:
-            _placed(found, body, stacks[body.id], floor, boxes, rules)
+            hidden = 0.0 if floor is None or body.agent else body.hidden_foot(floor.top)
+            _placed(found, body, stacks[body.id], floor, hidden, boxes, rules)
             if not body.person:
-                _on_top(found, body, tops, boxes, rules)
+                _on_top(found, body, tops, hidden, boxes, rules)
     seen: dict[int, list[float]] = {}
     if T_world_robot is not None:
         seen = {b.id: (T_world_robot[:3, :2].T @ b.center).tolist() for b in things}
@@ -143,10 +144,14 @@ def _placed(
     body: Body,
     others: Sequence[Body],
     floor: Body | None,
+    hidden: float,
     boxes: BoxPairs,
     rules: RelationRules,
 ) -> None:
-    """Finds what a thing is in, or else what it stands or lies on: one thing at most."""
+    """Finds what a thing is in, or else what it stands or lies on: one thing at most.
+
+    `hidden` is how surely it stands on the floor and something hides its foot: then it is not on what its box ends at.
+    """
     best: tuple[float, str, int] = (0.0, "", 0)
     for other in others:
         if other.agent:
@@ -163,24 +168,32 @@ def _placed(
                 best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
                 continue
         if share > 0.3 and upon:
-            best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), "on", other.id))
+            score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)) * (1 - hidden)
+            best = max(best, (score, "on", other.id))
     height = body.bottom if floor is None else body.bottom - floor.top
     if best[0] < 0.5 and floor is not None and height <= 0.3:
         best = max(best, (1 - max(0.0, height) / 0.6, "on", FLOOR))
+    best = max(best, (hidden, "on", FLOOR))
     if best[0] > 0:
         found[body.id, best[1], best[2]] = best[0]
 
 
 def _on_top(
-    found: dict[Relation, float], body: Body, tops: Sequence[Body], boxes: BoxPairs, rules: RelationRules
+    found: dict[Relation, float],
+    body: Body,
+    tops: Sequence[Body],
+    hidden: float,
+    boxes: BoxPairs,
+    rules: RelationRules,
 ) -> None:
-    """Finds the surface above the floor that a thing stands or lies on."""
+    """Finds the surface above the floor that a thing stands or lies on; `hidden` as in `_placed`."""
     best: tuple[float, int] = (0.0, 0)
     for top in tops:
         off = abs(body.bottom - top.top)
         upon = body.center[2] > top.top - rules.flat
         if off <= 2 * rules.touch and upon and (share := boxes.share(body, top)) > 0.3:
-            best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), top.id))
+            score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)) * (1 - hidden)
+            best = max(best, (score, top.id))
     if best[0] > 0:
         found[body.id, "on", best[1]] = best[0]
 

@@ -136,3 +136,17 @@ def test_the_pose_of_a_grid() -> None:
     grid = OccupancyGrid(stamp=0, frame="map", resolution=0.1, cells=np.zeros((1, 1), np.int8), position=[1, 2, 3])
     assert np.array_equal(grid.matrix()[:3, :3], np.eye(3))
     assert np.allclose(grid.replace(orientation=quaternion_from_yaw(0.5)).matrix(), T)
+
+
+@pytest.mark.parametrize("pitch", [0.0, np.radians(28), -0.3])
+def test_a_level_camera_looks_ahead_and_down_by_its_pitch(pitch: float) -> None:
+    made = Transforms.level_camera(1.2, pitch)
+    assert (made.frames, made.child_frames) == (("base_link",), ("camera",))
+    R, t = made.matrix("camera")[:3, :3], made.matrix("camera")[:3, 3]
+    assert np.allclose(t, [0, 0, 1.2])
+    assert np.allclose(R @ R.T, np.eye(3))
+    assert np.isclose(np.linalg.det(R), 1)
+    assert np.allclose(R @ [1, 0, 0], [0, -1, 0])  # the image's right is the base's right: not rolled
+    assert np.allclose(R @ [0, 0, 1], [np.cos(pitch), 0, -np.sin(pitch)])
+    ground = R @ (1.2 / np.sin(pitch) * np.array([0, 0, 1])) + t if pitch else np.zeros(3)
+    assert np.isclose(ground[2], 0)

@@ -71,7 +71,7 @@ def write_text_tower(file: Path, merges: Path, *, mask: bool = True) -> Path:
     return _saved(file, nodes, inputs, outputs, [numpy_helper.from_array(v, name) for name, v in values.items()])
 
 
-def write_open_detector(file: Path, merges: Path, boxes: Any, colors: Any) -> Path:
+def write_open_detector(file: Path, merges: Path, boxes: Any, colors: Any, *, mask_first: bool = False) -> Path:
     """A network of OWL-ViT's signature: it finds boxes (N, 4), which have colours (N, 3), by words for these."""
     import onnx
     from onnx import helper, numpy_helper
@@ -95,6 +95,7 @@ def write_open_detector(file: Path, merges: Path, boxes: Any, colors: Any) -> Pa
         "pixel_values": (real, [1, 3, 48, 64]),
         "attention_mask": (number, ["c", "length"]),
     }
+    inputs = dict(reversed(inputs.items())) if mask_first else inputs
     outputs = {
         "logits": (real, [1, given.shape[1], "c"]),
         "pred_boxes": (real, list(given.shape)),

@@ -17,13 +17,17 @@ CONTENT = bytes(range(256)) * 3000
 
 @dataclass
 class Served:
-    """What the server does: `cuts` holds after how many bytes each of the next connections ends; then all is sent."""
+    """What the server does: `cuts` holds after how many bytes each of the next connections ends; then all is sent.
+
+    `told`: whether it says how long an answer is.
+    """
 
     url: str = ""
     content: bytes = CONTENT
     cuts: list[int] = field(default_factory=list)
     ranges: bool = True
     code: int = 200
+    told: bool = True
     asked: list[str | None] = field(default_factory=list)
 
 
@@ -43,7 +47,8 @@ def serving() -> Iterator[Served]:
             self.send_response(206 if begin else 200)
             if begin:
                 self.send_header("Content-Range", f"bytes {begin}-{len(state.content) - 1}/{len(state.content)}")
-            self.send_header("Content-Length", str(len(part)))
+            if state.told:
+                self.send_header("Content-Length", str(len(part)))
             self.end_headers()
             self.wfile.write(part[: state.cuts.pop(0)] if state.cuts else part)
 

@@ -21,6 +21,7 @@ Box = tuple[Array, Array, float]
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
 _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
+_CALIBRATED = np.radians(0.3)  # and by such an angle, since cameras are not calibrated better
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
 _TAIL_FLAT, _TAIL_ROUND = 1.4, 0.8  # and those of single views, on flat sides and on round ones, which recede
@@ -105,7 +106,7 @@ def fit_cuboid(
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
+    weights = edges / (_stray(P) + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
 
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
@@ -198,6 +199,12 @@ def _starts(start: Box, eyes: Array, logs: Array) -> Array:
     rows[:, :3], rows[:, 3:6], rows[:, 6] = center, np.log(sizes), yaw
     rows[:, :2] += axes[deep] * np.sign(along[deep]) * lack[:, None] / 2
     return rows
+
+
+def _stray(P: Array) -> Array:
+    """Returns by how many pixels (V, 1) edges stray in views (3, V, 4), whatever the size of the box."""
+    focal = np.linalg.norm(np.cross(P[0, :, :3], P[2, :, :3]), axis=1)  # the third row turns only
+    return np.asarray(np.hypot(_PIXELS, _CALIBRATED * focal)[:, None])
 
 
 def _surface(rows: Array, places: Array, count: int, cut: int, noise: float, inset: float) -> Array:

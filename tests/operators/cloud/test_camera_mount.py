@@ -80,6 +80,17 @@ def test_a_given_base_is_compared_with_the_first_view_that_shows_the_vertical(do
     assert (said in mount.finding()) is wrong
 
 
+@pytest.mark.parametrize(("roll", "perhaps"), [(0, False), (90, True), (180, True), (-90, True), (45, False)])
+def test_a_camera_that_is_given_as_on_its_side_or_upside_down_may_be_so(roll: float, perhaps: bool) -> None:
+    T = _mounted(0)
+    T[:3, :3] = T[:3, :3] @ turned(0, roll).T
+    mount = CameraMount()
+    given = Transforms.from_matrix(T, stamp=0, frame="base_link", child_frame="depth")
+    play(mount, {"cloud": [cloud(room(0 if roll else 28, 0))], "extrinsics": [given]})
+    assert mount.finding()
+    assert ("if it is not mounted on its side or upside down, the extrinsics are wrong" in mount.finding()) is perhaps
+
+
 def test_a_given_base_is_not_called_wrong_where_no_surface_shows_the_vertical() -> None:
     given = Transforms.from_matrix(_mounted(0), stamp=0, frame="base_link", child_frame="depth")
     nothing = [cloud(NOTHING, stamp) for stamp in (0, 1_000_000_000, 2_000_000_000, 3_000_000_000)]

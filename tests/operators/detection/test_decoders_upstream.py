@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 150, 90  # of the image
 IMAGE = Image(
     stamp=3, frame="camera", data=np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 )
-KINDS = {"float32": "FLOAT", "float16": "FLOAT16", "int64": "INT64", "uint8": "UINT8"}
+KINDS = {"float32": "FLOAT", "float16": "FLOAT16", "int64": "INT64", "int32": "INT32", "uint8": "UINT8"}
 
 
 def model_that_answers(
@@ -32,13 +32,16 @@ def model_that_answers(
     outputs: dict[str, np.ndarray],
     *,
     sized: str | None = None,
+    sized_as: str = "int64",
+    sized_first: bool = False,
     kind: str = "float32",
     size: tuple[int, int] = (SIDE, SIDE),
 ) -> str:
     """A model that gives these values whatever it sees; that named `sized` times its second input, (w, h)."""
     make = onnx.helper
     shapes = {"images": [1, 3, *size[::-1]]} | ({"orig_target_sizes": [1, 2]} if sized else {})
-    kinds = {"images": KINDS[kind], "orig_target_sizes": "INT64"}
+    kinds = {"images": KINDS[kind], "orig_target_sizes": KINDS[sized_as]}
+    shapes = dict(reversed(shapes.items())) if sized_first else shapes
     inputs = [make.make_tensor_value_info(n, getattr(onnx.TensorProto, kinds[n]), s) for n, s in shapes.items()]
     nodes = [make.make_node("Identity", [f"{name}_values"], [name]) for name in outputs if name != sized]
     if sized:
@@ -144,6 +147,25 @@ def test_rtdetr_gives_the_boxes_of_its_own_postprocessor(tmp_path: Path, kind: s
     assert_same(found, given * scale, scores[0, strong].astype(np.float32), labels[0, strong])
 
 
+@pytest.mark.parametrize("kind", ["int64", "int32", "float32", "float16"])
+@pytest.mark.parametrize("order", [("labels", "boxes", "scores"), ("scores", "boxes", "labels")])
+def test_inputs_and_outputs_of_rtdetr_may_come_in_any_order(tmp_path: Path, kind: str, order: Sequence[str]) -> None:
+    outputs = {
+        "labels": np.array([[0, 1, 2]]),
+        "boxes": np.array([[[0, 0, 0.5, 0.5], [0.1, 0.2, 0.6, 0.7], [0.5, 0.5, 1, 1]]], np.float32),
+        "scores": np.array([[0.9, 0.8, 0.7]], np.float32),
+    }
+    model = model_that_answers(
+        tmp_path / "m.onnx",
+        {name: outputs[name] for name in order},
+        sized="boxes",
+        sized_as=kind,
+        sized_first=order[0] == "scores",
+    )
+    found = found_by(model, "rtdetr", "abc", tmp_path)
+    assert_same(found, outputs["boxes"][0] * [WIDTH, HEIGHT, WIDTH, HEIGHT], [0.9, 0.8, 0.7], [0, 1, 2])
+
+
 def test_a_detr_and_its_masks_as_the_postprocess_of_rf_detr(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     logits = rng.normal(-1, 1.5, (1, 12, 3)).astype(np.float32)
@@ -179,13 +201,16 @@ def test_a_detr_of_four_classes_has_its_boxes_where_its_authors_put_them(tmp_pat
     assert_same(found, corners * np.array([WIDTH, HEIGHT] * 2), expected, [1, 3, 0])
 
 
-def test_masks_of_prototypes_as_ultralytics_draws_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("decoder", ["yolov8", "yolov5"])
+def test_masks_of_prototypes_as_ultralytics_draws_them(tmp_path: Path, decoder: str) -> None:
     rng = np.random.default_rng(5)
     rows = np.vstack([rng.uniform(15, 49, (2, 8)), rng.uniform(10, 30, (2, 8)), np.linspace(0.4, 0.9, 8)[None]])
     coefficients, prototypes = rng.normal(0, 1, (4, 8)), rng.normal(0, 1, (1, 4, 16, 16)).astype(np.float32)
     output = np.vstack([rows, coefficients]).astype(np.float32)[None]
+    if decoder == "yolov5":  # rows, with an objectness
+        output = np.insert(output, 4, 1, axis=1).transpose(0, 2, 1).copy()
     model = model_that_answers(tmp_path / "m.onnx", {"output0": output, "output1": prototypes})
-    found = found_by(model, "yolov8", ["crate"], tmp_path, nms_iou=0.99, fit="letterbox")
+    found = found_by(model, decoder, ["crate"], tmp_path, nms_iou=0.99, fit="letterbox")
 
     ratio = SIDE / WIDTH
     top = (SIDE - round(HEIGHT * ratio)) // 2
@@ -203,7 +228,7 @@ def test_masks_of_prototypes_as_ultralytics_draws_them(tmp_path: Path) -> None:
     inside = (columns >= x1) & (columns < x2) & (rows_ >= y1) & (rows_ < y2)  # `crop_mask`
     for k, expected in enumerate(((grown > 0) & inside).numpy()):
         assert np.mean(found.mask(k) != expected) < 0.002
-    assert not found_by(model, "yolov8", ["crate"], tmp_path, masks=False).masks
+    assert not found_by(model, decoder, ["crate"], tmp_path, masks=False).masks
 
 
 @pytest.mark.parametrize("whole", [True, False], ids=["of the input", "of each box"])
@@ -255,16 +280,40 @@ def test_boxes_after_suppression_pass_in_every_form(tmp_path: Path, form: str) -
     assert_same(found, boxes[:3] * scale, scores[:3], labels[:3])
 
 
-def test_tensorflows_boxes_have_their_rows_first_and_cocos_numbers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", ["boxes classes scores", "detection_scores:0 detection_classes:0 detection_boxes:0"])
+def test_tensorflows_boxes_have_their_rows_first_and_cocos_numbers(tmp_path: Path, names: str) -> None:
     boxes = np.array([[[0.1, 0.2, 0.5, 0.6], [0, 0, 0.4, 0.3], [0.2, 0.2, 0.9, 0.8]]], np.float32)
     outputs = {
         "boxes": boxes,
         "classes": np.array([[1.0, 2, 1]], np.float32),
         "scores": np.array([[0.9, 0.8, 0.7]], np.float32),
     }
-    found = found_by(model_that_answers(tmp_path / "m.onnx", outputs), "tensorflow", ["none", "a", "b"], tmp_path)
+    given = {name: next(v for k, v in outputs.items() if k in name) for name in names.split()}
+    found = found_by(model_that_answers(tmp_path / "m.onnx", given), "tensorflow", ["none", "a", "b"], tmp_path)
     size = np.array([WIDTH, HEIGHT, WIDTH, HEIGHT])
     assert_same(found, boxes[0][:, [1, 0, 3, 2]] * size, [0.9, 0.8, 0.7], [1, 2, 1])
+
+
+@pytest.mark.parametrize("scores_first", [True, False])
+@pytest.mark.parametrize("classes", ["ab", "abc", "abcd"])
+def test_an_ssd_of_any_number_of_classes(tmp_path: Path, classes: str, scores_first: bool) -> None:
+    if len(classes) == 3 and not scores_first:
+        pytest.skip("of three classes the scores come first")
+    scores = np.full((1, 4, 1 + len(classes)), 0.01, np.float32)
+    scores[0, [0, 1, 2], [1, 2, 1]] = [0.9, 0.8, 0.7]
+    boxes = np.array([[[0, 0, 0.5, 0.5], [0.1, 0.2, 0.6, 0.7], [0.5, 0.5, 1, 1], [0, 0, 1, 1]]], np.float32)
+    outputs = {"scores": scores, "boxes": boxes}
+    given = outputs if scores_first else dict(reversed(outputs.items()))
+    found = found_by(model_that_answers(tmp_path / "m.onnx", given), "ssd", classes, tmp_path)
+    assert_same(found, boxes[0, :3] * [WIDTH, HEIGHT, WIDTH, HEIGHT], [0.9, 0.8, 0.7], [0, 1, 0])
+
+
+def test_rows_that_fill_up_an_export_are_no_objects(tmp_path: Path) -> None:
+    boxes = np.tile(np.array([1, 2, 30, 40], np.float32), (5, 1))
+    model = model_that_answers(
+        tmp_path / "m.onnx", end_to_end("mmdeploy", boxes, np.array([0.9, 0.8, 0.7, 0, 0]), np.array([0, 1, 2, -1, -1]))
+    )
+    assert found_by(model, "end2end", "abc", tmp_path, score_threshold=0.0).labels() == ("a", "b", "c")
 
 
 @pytest.mark.parametrize(

@@ -27,10 +27,13 @@ def image(camera: str, red: int, size: tuple[int, int] = (48, 64), stamp: int = 
 IMAGES = [image("front", 255), image("left", 120, (90, 70)), image("rear", 10)]
 
 
-def network(file: Path, *, batch: bool = True, joined: bool = False) -> str:
+def network(
+    file: Path, *, batch: bool = True, joined: bool = False, doubled: bool = False, told: int | str = "n"
+) -> str:
     """A model of YOLOv8's signature that finds one box, whose score and middle are the mean of the image.
 
-    With `joined` its answers are not apart by image.
+    With `joined` its answers are not apart by image, with `doubled` it gives each twice; `told` is the first extent of
+    the output that it tells.
     """
     make, real = onnx.helper, onnx.TensorProto.FLOAT
     nodes = [
@@ -38,7 +41,8 @@ def network(file: Path, *, batch: bool = True, joined: bool = False) -> str:
         make.make_node("Unsqueeze", ["mean", "behind"], ["share"]),
         make.make_node("Mul", ["share", "factors"], ["scaled"]),
         make.make_node("Add", ["scaled", "added"], ["row"]),
-        make.make_node("Reshape", ["row", "shape"], ["output"]),
+        make.make_node("Reshape", ["row", "shape"], ["apart"]),
+        make.make_node("Concat", ["apart"] * (1 + doubled), ["output"], axis=0),
     ]
     values = {
         "behind": np.array([1]),
@@ -47,7 +51,7 @@ def network(file: Path, *, batch: bool = True, joined: bool = False) -> str:
         "shape": np.array([1, 5, -1] if joined else [-1, 5, 1]),
     }
     count = "n" if batch else 1
-    shapes = {"images": [count, 3, 64, 64]}, {"output": [1 if joined else count, 5, "m"]}
+    shapes = {"images": [count, 3, 64, 64]}, {"output": [told if batch else 1, 5, "m"]}
     ports = [[make.make_tensor_value_info(n, real, s) for n, s in each.items()] for each in shapes]
     kept = [onnx.numpy_helper.from_array(value, name) for name, value in values.items()]
     graph = make.make_graph(nodes, "mean", *ports, kept)
@@ -95,11 +99,41 @@ def test_each_camera_has_its_own_boxes(tmp_path: Path, batch: bool, monkeypatch:
 
 
 def test_answers_that_are_not_apart_by_image_are_refused(tmp_path: Path) -> None:
-    model = network(tmp_path / "m.onnx", joined=True)
+    model = network(tmp_path / "m.onnx", doubled=True)
     made = OnnxRigDetector(cameras=CAMERAS, model=model, decoder="yolov8", classes="a")
     made.setup()
-    with pytest.raises(ModelError, match=r"was given 3 images and answered \(1, 5, 3\), .* export it for one image"):
+    with pytest.raises(ModelError, match=r"was given 3 images and answered \(6, 5, 1\), .* export it for one image"):
         made.process({each.frame: each for each in IMAGES})
+
+
+@pytest.mark.parametrize("told", [1, "m"])
+def test_a_network_that_does_not_tell_its_answers_apart_gets_each_image_alone(
+    tmp_path: Path, told: int | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sessions = opened(monkeypatch)
+    model = network(tmp_path / "m.onnx", joined=True, told=told)
+    made = OnnxRigDetector(cameras=CAMERAS, model=model, decoder="yolov8", classes="a", score_threshold=0.05)
+    made.setup()
+    found = made.process({each.frame: each for each in IMAGES})
+    assert [found[f"detections_{k}"].count for k in (1, 2, 3)] == [1, 1, 1]
+    assert sessions[0].calls == [1, 1, 1]
+
+
+def test_rows_of_all_images_in_one_list_are_not_dealt_out_to_the_cameras(tmp_path: Path) -> None:
+    """YOLOv7's export for a batch calls its list of boxes (N, 7) as long as the batch; two boxes are of two images."""
+    make, real = onnx.helper, onnx.TensorProto.FLOAT
+    rows = np.array([[0, 4, 6, 40, 50, 0, 0.9], [0, 1, 1, 30, 20, 0, 0.8]], np.float32)
+    ports = [
+        [make.make_tensor_value_info(name, real, shape)]
+        for name, shape in (("images", ["batch", 3, 64, 64]), ("output", ["batch", 7]))
+    ]
+    kept = [onnx.numpy_helper.from_array(rows, "rows")]
+    graph = make.make_graph([make.make_node("Identity", ["rows"], ["output"])], "rows", *ports, kept)
+    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), tmp_path / "m.onnx")
+    made = OnnxRigDetector(cameras=CAMERAS, model=str(tmp_path / "m.onnx"), decoder="end2end", classes="a")
+    made.setup()
+    found = made.process({each.frame: each for each in IMAGES[:2]})
+    assert [found[f"detections_{k}"].count for k in (1, 2)] == [2, 2]
 
 
 def test_rows_of_detectors_are_for_rigs_too() -> None:

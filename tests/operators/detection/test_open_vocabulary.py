@@ -72,6 +72,14 @@ def test_it_finds_what_is_named_as_its_authors_read_the_outputs(named: str) -> N
     np.testing.assert_allclose(message.boxes, corners, atol=1e-3)
 
 
+def test_the_mask_of_the_names_may_be_its_first_input(named: str, tmp_path: Path) -> None:
+    expected = detector(model=named, classes="red, blue").process(IMAGE).digest()
+    write_open_detector(
+        tmp_path / "cache" / "open.onnx", tmp_path / "cache" / "open.tokenizer.txt", BOXES, COLORS, mask_first=True
+    )
+    assert detector(model=named, classes="red, blue").process(IMAGE).digest() == expected
+
+
 def test_names_may_be_added_while_it_runs_and_keep_their_numbers(named: str) -> None:
     made = detector(model=named, classes="red, blue")
     before = made.process(IMAGE)
@@ -84,6 +92,16 @@ def test_names_may_be_added_while_it_runs_and_keep_their_numbers(named: str) -> 
         made.set_parameter("classes", "green")
     assert (made.classes, made.params.classes) == ("red, blue, green", "red, blue, green")
     assert made.process(IMAGE).digest() == after.digest()
+
+
+@pytest.mark.parametrize("classes", ["red, blue,", "red,,blue", ",", "red, red", ""])
+def test_an_empty_name_or_one_given_twice_is_refused(named: str, classes: str) -> None:
+    with pytest.raises(ModelError, match="names a class twice or has an empty name"):
+        detector(model=named, classes=classes)
+    made = detector(model=named, classes="red")
+    with pytest.raises(ParameterError, match="names a class twice or has an empty name"):
+        made.set_parameter("classes", classes)
+    assert made.process(IMAGE).class_names == ("red",)
 
 
 def test_without_names_or_a_tokenizer_it_is_refused(named: str, tmp_path: Path) -> None:

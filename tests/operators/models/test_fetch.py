@@ -70,6 +70,19 @@ def test_a_longer_file_is_not_read_to_its_end(served: Served, cache: Path) -> No
     assert max(shown) == len(CONTENT) + 1
 
 
+@pytest.mark.parametrize("told", [True, False], ids=["its length is told", "its length is not told"])
+@pytest.mark.parametrize("ranges", [True, False], ids=["ranges", "no ranges"])
+def test_a_shorter_file_is_another_one_and_asked_for_seldom(
+    served: Served, cache: Path, told: bool, ranges: bool
+) -> None:
+    served.content, served.ranges, served.told = b"<html>Log in first</html>", ranges, told
+    with pytest.raises(FetchError, match="another file: 25 bytes" if told or ranges else "cannot be reached"):
+        fetch(model_of(CONTENT, url=served.url))
+    assert len(served.asked) <= fetching.TRIES + 1
+    served.content = CONTENT
+    assert fetch(model_of(CONTENT, url=served.url)).read_bytes() == CONTENT
+
+
 @pytest.mark.parametrize("cuts", [[], [1] * 100], ids=["one slow connection", "many that bring a byte each"])
 def test_a_download_has_a_bound_of_time_and_goes_on_in_the_next_call(
     served: Served, cache: Path, monkeypatch: pytest.MonkeyPatch, cuts: list[int]

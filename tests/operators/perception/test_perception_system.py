@@ -139,6 +139,23 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
     assert blind.pose is not None
     assert blind.cloud is None
     assert blind.graph is None
+    assert system.graph is not None
+    assert system.graph.stamp < blind.stamp
+
+
+def test_a_camera_whose_base_is_found_needs_no_extrinsics(room: Room) -> None:
+    """The registered images of one camera, as most drivers give them."""
+    depth_info = room.depth_info.replace(frame=room.image_info.frame)
+    given = {"image_info": room.image_info, "depth_info": depth_info, "segment": False}
+    with pytest.raises(ValueError, match=r"Transforms\.level_camera\(height, pitch\); .* mount=True finds it"):
+        PerceptionSystem(**given)
+    with PerceptionSystem(**given, mount=True, surfaces=False) as system:
+        assert system.graph is None
+        for stamp, step in list(room.given("image", "depth"))[:2]:
+            images = {name: message.data for name, message in step.items()}
+            result = system.process(stamp, **images)
+        assert result.cloud is not None
+        assert "mount" not in system.left_out
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
-from operators.inference import ModelError
+from operators.inference import ModelError, open_session
 from operators.segmentation import OnnxSegmenter, draw_segmentation
 
 onnx = pytest.importorskip("onnx")
@@ -282,6 +282,39 @@ def test_a_provider_that_finds_no_device_is_not_silently_replaced_by_the_cpu(
         pytest.raises(ModelError, match="provider 'cuda' could not start: is there such a device"),
     ):
         made.setup()
+
+
+@pytest.mark.parametrize(
+    ("provider", "expected"),
+    [
+        ("cuda:1", [("CUDAExecutionProvider", {"device_id": 1})]),
+        ("cuda", ["CUDAExecutionProvider"]),
+        ("tensorrt:2", [("TensorrtExecutionProvider", {"device_id": 2}), ("CUDAExecutionProvider", {"device_id": 2})]),
+        ("openvino", ["OpenVINOExecutionProvider"]),
+        ("cpu", []),
+    ],
+)
+def test_a_card_is_chosen_by_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, provider: str, expected: list[Any]
+) -> None:
+    class Session:
+        def __init__(self, model: str, options: Any, providers: list[Any]) -> None:
+            self.providers = providers
+
+        def get_providers(self) -> list[str]:
+            return [each if isinstance(each, str) else each[0] for each in self.providers]
+
+    names = ["Tensorrt", "CUDA", "OpenVINO", "CPU"]
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [f"{n}ExecutionProvider" for n in names])
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    session: Any = open_session(Path(save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED)), provider)
+    assert session.providers == [*expected, "CPUExecutionProvider"]
+
+
+@pytest.mark.parametrize("provider", ["cuda:", "cuda:x", "cpu:1", "gpu", "openvino:1"])
+def test_another_provider_is_refused(provider: str) -> None:
+    with pytest.raises(ValueError, match="provider"):
+        OnnxSegmenter(model="m.onnx", provider=provider)
 
 
 @pytest.mark.long
