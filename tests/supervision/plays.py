@@ -41,6 +41,8 @@ class Play:
         endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.processes)}
         self.core = core_of(self.plan, self.processes, configurations(self.plan, self.processes, endpoints))
         self.now = 100.0
+        self.stood = 0.0
+        """Seconds for which the machine stood still: the clock went on, the supervisor's own did not."""
         self.commands: list[Command] = []
         self.over: Over | None = None
         self.deaf: set[str] = set()
@@ -60,7 +62,7 @@ class Play:
         self._answers.extend(events)
         given: list[Command] = []
         while self._answers:
-            for command in self.core.handle(self._answers.popleft(), Moment(self.now, WALL + self.now)):
+            for command in self.core.handle(self._answers.popleft(), Moment(self.now, WALL + self.now + self.stood)):
                 given.append(command)
                 self._do(command)
                 self.commands.append(command)

@@ -20,6 +20,7 @@ from dataflow.supervision.core.events import (
     Died,
     LinkChanged,
     NotReading,
+    Paused,
     Said,
     Tick,
     TriggerAsked,
@@ -680,6 +681,24 @@ def test_a_source_that_falls_behind_again_is_named_again() -> None:
         play.tell(Said("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [late, late]}}))
     assert len(play.core.status.notes) == 2
     assert play.core.status.behind == {"left": 1.3}
+
+
+def test_a_source_is_late_by_no_standstill_of_the_machine() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+
+    def late(read: float, sent: float) -> list[str]:
+        play.tell(Said("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [read, sent]}}))
+        return [note for note in play.core.status.notes if "left" in note]
+
+    late(0.0, 0.0)
+    play.stood += 5.0
+    play.tell(Paused(5.5, uncounted=5.0))
+    assert late(0.0, 0.0) == []  # sent before
+    assert late(1.0, 5.0) == late(5.2, 5.2) == []
+    play.wait(2.0)
+    assert late(5.3, 5.3) == late(0.2, 0.2) == []
+    assert len(late(0.2, 1.4)) == 1  # it had caught up: that is its own
+    assert play.core.status.behind == {"left": 1.4}
 
 
 # -- rules that a process may break -----------------------------------------------------------------------------------

@@ -20,8 +20,10 @@ ITS_OWN = 0.5
 """Share of its lateness that a source must have when it is read, to be the one that is slow."""
 AT_WORK = 0.7
 """CPU time of a source, as a share of the time that has passed, from which reading it takes longer than real time."""
-
-
+STANDSTILL = 0.5
+"""Seconds that the clock is further ahead of the supervisor's own from which the machine stood still, or it was set."""
+ON_THE_WAY = 1.0
+"""Seconds after a standstill within which what a source reports may be from before it."""
 IDLE = 0.05
 """Share of CPU time in the time that reading takes, up to which it does nothing but wait."""
 
@@ -52,8 +54,15 @@ class Lateness(Watcher):
 
     def __init__(self, run: RunState) -> None:
         super().__init__(run)
+        self._late: dict[str, float] = {}
         self._worst: dict[str, float] = {}
         self._said: set[str] = set()
+        self._excused = dict.fromkeys((node.name for node in run.graph.sources()), 0.0)
+        """By source, of its lateness what no source is to blame for: the machine stood still."""
+        self._ahead = self._stood_at = 0.0
+
+    def released(self) -> None:
+        self._ahead = self.run.now.wall - self.run.steady
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind == "progress":
@@ -63,15 +72,27 @@ class Lateness(Watcher):
             self._waits(fields["operator"], fields["last"], fields["stamp"], fields["seconds"])
 
     def _take(self, process: Supervised, source: str, read: float, sent: float) -> None:
-        behind = max(read, sent)
-        self.run.status.behind[source] = behind
-        self._worst[source] = max(behind, self._worst.get(source, 0.0))
-        if behind > LATE and source not in self._said:
+        self.run.status.behind[source] = max(read, sent)
+        excused = self._excuse(source, max(read, sent))
+        read, sent = max(0.0, read - excused), max(0.0, sent - excused)
+        late = self._late[source] = max(read, sent)
+        self._worst[source] = max(late, self._worst.get(source, 0.0))
+        if late > LATE and source not in self._said:
             self._said.add(source)
             why = self._why(process, source, read, sent)
             self.run.event("behind", f"source {source!r} has fallen behind the clock: {why}", operator=source)
-        elif behind < LATE / 2:
+        elif late < LATE / 2:
             self._said.discard(source)
+
+    def _excuse(self, source: str, behind: float) -> float:
+        """Returns how much of its lateness no source is to blame for; less as it catches up."""
+        ahead, steady = self.run.now.wall - self.run.steady, self.run.steady
+        if abs(stood := ahead - self._ahead) > STANDSTILL:
+            self._ahead, self._stood_at = ahead, steady
+            self._excused = {name: max(0.0, excused + stood) for name, excused in self._excused.items()}
+        if steady - self._stood_at > ON_THE_WAY:
+            self._excused[source] = min(self._excused[source], behind)
+        return self._excused[source]
 
     def _why(self, process: Supervised, source: str, read: float, sent: float) -> str:
         run = self.run
@@ -88,9 +109,9 @@ class Lateness(Watcher):
         self.run.event("clock_wait", text, operator=source, stamp=stamp, seconds=seconds)
 
     def closing(self) -> None:
-        for source, behind in sorted(self.run.status.behind.items()):
+        for source, late in sorted(self._late.items()):
             if self._worst[source] > LATE:
                 self.run.note(
-                    f"source {source!r} was {behind:.1f} s behind the clock at the end, "
+                    f"source {source!r} was {late:.1f} s behind the clock at the end, "
                     f"{self._worst[source]:.1f} s at most"
                 )
