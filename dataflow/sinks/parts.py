@@ -20,7 +20,7 @@ from typing import Any
 from dataflow.editing.joins import holding
 from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
-from dataflow.messages import Diagnostics
+from dataflow.messages import CompressedVideo, Diagnostics
 from dataflow.messages.base import Message
 from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.layout import CUT
@@ -111,7 +111,7 @@ class PartsSink:
             self._statics[stream] = message, seq, incarnation
         else:
             self._advance(message.stamp)
-        part = self._current if self._full is None else self._part_at(message.stamp)
+        part = self._part_of(stream, message)
         if part is not None:
             try:
                 part.sink.message(stream, message, seq, incarnation)
@@ -220,11 +220,15 @@ class PartsSink:
     def _is_full(self, part: Part) -> bool:
         return self._storage.splitting.due(part.sink.writer.saved_bytes, self._clock - self._begun, part.front)
 
-    def _part_at(self, stamp: int) -> Part | None:
+    def _part_of(self, stream: str, message: Message) -> Part | None:
+        """The part into which a message belongs; None where it is lost. Behind a full disk that is also the one whose
+        record is: it came late. A packet of video stays, as those after it need it."""
         current = self._current
-        if self._full is not None and current is not None and stamp < (current.start or 0):
+        late = current is not None and message.stamp < (current.start or 0)
+        if late and self._full is not None:
             return self._full
-        return current
+        stays = stream in self._static or isinstance(message, CompressedVideo)
+        return None if late and self._after_gap and not stays else current
 
     def _open(self, start: int | None) -> Part:
         """Begins a file with what every part holds. Raises `RecordingError`."""

@@ -113,11 +113,11 @@ class VerifyReport:
 
     @property
     def empty(self) -> bool:
-        """Nothing but the end of operators was repeated of a run that was cut: nothing was verified."""
+        """A run that was cut holds no calls but the end of operators: nothing was verified."""
         if not self.operators:
             return True
         repeated = sum(self.work[v.operator].firings if v.operator in self.work else v.verified for v in self.operators)
-        return self.cut and not repeated
+        return self.cut and not (repeated or any(v.unverifiable or v.unknown for v in self.operators))
 
     @property
     def changed(self) -> tuple[StoredStream, ...]:

@@ -72,6 +72,15 @@ def test_without_a_baseline_the_verdicts_are_those_of_verification() -> None:
     assert verdicts(found) == {"a": "identical", "b": "culprit", "c": "downstream"}
 
 
+@pytest.mark.parametrize("why", ["unknown", "unverifiable"])
+def test_a_part_whose_calls_cannot_be_repeated_is_not_one_without_calls(why: str) -> None:
+    made = Verification("a", firings=9, cut=True)
+    found = replace(report({"a": None}, {}), operators=(made,))
+    assert found.empty
+    setattr(made, why, 9)
+    assert not found.empty
+
+
 def table() -> list[tuple[str, str, str, str]]:
     """The rows of the truth table in the docstring of `judge`: what is here, what is accepted, what else, verdict."""
     rows = [line.strip().strip("|").split("|") for line in (judge.__doc__ or "").splitlines() if "|" in line]
