@@ -69,7 +69,7 @@ class Unmade:
 
 class Debugger:
     """One operator of a recorded run. `calls` are its recorded calls, in order; `at` is the one that was made last.
-    `live_effects`: a call outside that is not recorded is made. `most_bytes`: of the messages of calls that are kept.
+    `make_effects`: a call outside that is not recorded is made. `most_bytes`: of the messages of calls that are kept.
 
     Runs the operator in this process, which should have the environment of operators (`threads.environment`): what
     depends on the hashes of strings else repeats only by chance. Raises `DebugError`, `ReplayError`, `RecordingError`,
@@ -82,10 +82,10 @@ class Debugger:
         operator: str,
         graph: Graph | None = None,
         *,
-        live_effects: bool = False,
+        make_effects: bool = False,
         most_bytes: int = MOST_HELD,
     ) -> None:
-        self._recording, self._live_effects = recording, live_effects
+        self._recording, self._make_effects = recording, make_effects
         self.graph = graph_that_is_here(recording)[0] if graph is None else graph
         log = FiringLog.read(recording)
         self.node = node = self.graph.nodes[_named(operator, self.graph, log)]
@@ -182,7 +182,7 @@ class Debugger:
             inputs={},
             seed=self.graph.seed,
             seeding=seeding_of(self._recording),
-            live_effects=self._live_effects,
+            make_effects=self._make_effects,
         )
         probe = runner.calls = Probe(runner)
         probe.target, probe.through = way[-1].call, through
@@ -421,7 +421,7 @@ class Debugger:
             log,
             made=lambda stream, entry: None,
             begin=begin,
-            live_effects=self._live_effects,
+            make_effects=self._make_effects,
         )
         runner = work.runners[self.node.name]
         self._probe = runner.calls = Probe(runner)

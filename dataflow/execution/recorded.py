@@ -46,7 +46,7 @@ class Watcher:
 class RecordedRunner(Runner):
     """One operator, re-executed by its records, of which `repetition` has those that are repeated. `inputs` are the
     digests of what it was given; `seeding` is the version by which the recorded run seeded its generators.
-    `live_effects`: see `RecordedJournal`. `guard` watches over what it is given in each firing; without one, only the
+    `make_effects`: see `RecordedJournal`. `guard` watches over what it is given in each firing; without one, only the
     first firings are watched."""
 
     def __init__(
@@ -61,13 +61,13 @@ class RecordedRunner(Runner):
         seeding: int = VERSION,
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
-        live_effects: bool = False,
+        make_effects: bool = False,
     ) -> None:
         operator, self._as_it_was = _with_code(node, repetition.code_of(0))
         super().__init__(node, operator, emitter)
         self._guard, self._watched = guard or MemoryGuard(), FOREVER if guard is not None else WATCHED
         self._watcher = watcher or Watcher()
-        self.effects = RecordedJournal(live=live_effects)
+        self.effects = RecordedJournal(make=make_effects)
         self.calls = Calls(node, self.operator, seed, version=seeding, effects=self.effects)
         self.judge = Judge(node.name, tuple(self.ports.states), inputs)
         self._repetition = repetition

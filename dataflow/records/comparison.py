@@ -45,7 +45,7 @@ class Verification:
     has digests of that code. `packages_changed`: packages
     of its environment (`env:`) of which it ran other versions, such as "numpy 1.26.4 -> 2.4.6".
     `wrote` names the first message that the operator has written into, which others may be given too.
-    `effects`: by name of a call how often its recorded answer was `given`, `missed`, and, where calls were made live,
+    `effects`: by name of a call how often its recorded answer was `given`, `missed`, and, where calls were made again,
     `again` and of these with the `same` answer.
     `began` is the state from which it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """

@@ -88,7 +88,7 @@ class Recomputation:
 
     Re-execution begins at the stamp `begin` (see `dataflow.records.repetition`) and ends before the firings from `end`
     on; `slices` are operators of which only the calls between two stamps are repeated (see `verification.slices`).
-    `guard` watches over the memory of what they are given; `live_effects`: see `RecordedJournal`. `in_turn`: operators
+    `guard` watches over the memory of what they are given; `make_effects`: see `RecordedJournal`. `in_turn`: operators
     whose calls are made in the order of the run (`RunnerInTurn`).
     `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
     ends of the streams that are made.
@@ -109,7 +109,7 @@ class Recomputation:
         slices: Mapping[str, tuple[int | None, int | None]] = _NOTHING,
         guard: MemoryGuard | None = None,
         watcher: Watcher | None = None,
-        live_effects: bool = False,
+        make_effects: bool = False,
         in_turn: Collection[str] = (),
     ) -> None:
         self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
@@ -134,7 +134,7 @@ class Recomputation:
                 seeding=seeding_of(recording),
                 guard=guard,
                 watcher=watcher,
-                live_effects=live_effects,
+                make_effects=make_effects,
             )
             for node in nodes
         }

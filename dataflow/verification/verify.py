@@ -91,7 +91,7 @@ def verify(
     start: float | None = None,
     jobs: int | None = None,
     paranoid: bool = False,
-    live_effects: bool = False,
+    make_effects: bool = False,
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
     workers: Workers | None = None,
@@ -105,7 +105,7 @@ def verify(
     `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, beside those with
     which they shared a process in the run (`verification.retrial`).
     `paranoid`: look after each call whether it has written into its inputs; else after the first few of each operator.
-    `live_effects`: make effects again, and compare their answers with the recorded ones, which operators get.
+    `make_effects`: make effects again, and compare their answers with the recorded ones, which operators get.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
@@ -123,7 +123,7 @@ def verify(
     played = task.graph
     options: dict[str, Any] = {"threads": played.threads, "stall_timeout": stall_timeout, "watch": watch}
     options |= {"early": early, "locate": _locate(task)}
-    request = _request(task, path, tolerance, paranoid=paranoid, live_effects=live_effects)
+    request = _request(task, path, tolerance, paranoid=paranoid, make_effects=make_effects)
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
         function = f"{part.__name__}:{part.verify_part.__name__}"
@@ -143,7 +143,7 @@ def verify(
     return replace(report, total=time.monotonic() - began)
 
 
-def _request(task: _Task, path: Path, tolerance: float | None, *, paranoid: bool, live_effects: bool) -> dict[str, Any]:
+def _request(task: _Task, path: Path, tolerance: float | None, *, paranoid: bool, make_effects: bool) -> dict[str, Any]:
     """Returns what each worker is asked (`job.verify_part`), but for its operators."""
     return {
         "path": str(path),
@@ -157,7 +157,7 @@ def _request(task: _Task, path: Path, tolerance: float | None, *, paranoid: bool
         "until": {},
         "guard": paranoid,
         "in_turn": (),
-        "live_effects": live_effects,
+        "make_effects": make_effects,
     }
 
 

@@ -34,8 +34,8 @@ TRIED: tuple[str, ...] = (
     "verify RECORDING --one-process --only sum --start 0 --paranoid --path HERE --junit OUT.xml --tolerance 1e-6"
     " --quiet --json",
     "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
-    "verify RECORDING --baseline OUT.json --accept --repeat 1 --live-effects",
-    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --live-effects",
+    "verify RECORDING --baseline OUT.json --accept --repeat 1 --make-effects",
+    "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --make-effects",
     "debug RECORDING smooth --do next --view OUT.rrd",
     "capture RECORDING --op sum --firing 3 --predicate stamp --graph GRAPH --set count=30 --path HERE --to OUT.py"
     " --overwrite --json",

@@ -628,14 +628,14 @@ def test_without_a_run_the_call_is_made() -> None:
     assert Asking().effect(ask, answer=3) == 3
 
 
-def test_live_calls_are_compared_and_misses_get_new_answers() -> None:
+def test_calls_that_are_made_again_are_compared_and_misses_get_new_answers() -> None:
     ran = recorded(lambda operator, x: operator.effect(ask, "A") + operator.effect(ask, "B", answer=1))
 
-    alike = again(ran, live_effects=True)
+    alike = again(ran, make_effects=True)
     assert alike.result.verdict == "identical"
     assert alike.result.effects == {"ask": {"given": 6, "missed": 0, "again": 6, "same": 3}}
 
-    changed = again(ran, lambda operator, x: operator.effect(ask, "C"), live_effects=True)
+    changed = again(ran, lambda operator, x: operator.effect(ask, "C"), make_effects=True)
     assert changed.result.verdict == "culprit"
     assert changed.result.first is not None
     assert changed.result.first.port == "out"

@@ -103,8 +103,8 @@ def test_the_debugger_goes_to_a_miss_and_asks_on_demand(asked: Path) -> None:
         assert found is not None
         assert found.number == 0
         assert "EffectMiss: miss at effect 0" in (found.error or "")
-        live = Debugger(recording, "describe", changed, live_effects=True).goto(0)
-        [made] = live.made
+        debugged = Debugger(recording, "describe", changed, make_effects=True).goto(0)
+        [made] = debugged.made
         assert "URLError" in made.here.text  # type: ignore[union-attr]
 
 
@@ -127,7 +127,7 @@ def test_parts_of_a_recording_keep_the_answers(asked: Path, tmp_path: Path) -> N
 
 
 def test_calls_are_made_again_on_demand_and_their_repeatability_is_reported(asked: Path) -> None:
-    told = invoke("verify", asked, "--live-effects", "--quiet")
+    told = invoke("verify", asked, "--make-effects", "--quiet")
 
     assert "made again 12 times, 0 answered as recorded" in told  # the service is gone
 

@@ -27,7 +27,7 @@ from dataflow.cli.support.arguments import (
     span,
 )
 from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, size
-from dataflow.cli.support.run_options import LiveEffects
+from dataflow.cli.support.run_options import MakeEffects
 
 EDITOR_COMES = 3600.0
 """Seconds that --dap waits for an editor."""
@@ -70,7 +70,7 @@ def debug(
     graph: OtherGraph = None,
     settings: OtherSettings = None,
     path: ModuleFolders = None,
-    live_effects: LiveEffects = False,
+    make_effects: MakeEffects = False,
     view: ViewTarget = None,
     dap: DapPort = None,
     json: Json = False,
@@ -102,7 +102,7 @@ def debug(
         if dap is not None and (do or json or view):
             raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
         loaded = begin_again(recording, graph, settings, path, operator.partition("@")[0])
-        _debug(recording, operator, loaded, do, live_effects=live_effects, view=view, dap=dap, json=json)
+        _debug(recording, operator, loaded, do, make_effects=make_effects, view=view, dap=dap, json=json)
 
 
 def capture(
@@ -212,7 +212,7 @@ def _debug(
     graph: Graph | None,
     do: list[str] | None,
     *,
-    live_effects: bool,
+    make_effects: bool,
     view: str | None,
     dap: float | None,
     json: bool,
@@ -223,7 +223,7 @@ def _debug(
 
     name, _, when = operator.partition("@")
     with Recording(recording) as opened:
-        debugger = Debugger(opened, name, graph, live_effects=live_effects)
+        debugger = Debugger(opened, name, graph, make_effects=make_effects)
         begin, _ = span(opened, opened.streams) or (0, 0)
         viewer = None if view is None else _viewer(debugger, view)
         shell = Shell(debugger, begin, json=json, viewer=viewer)

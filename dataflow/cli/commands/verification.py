@@ -35,7 +35,7 @@ from dataflow.cli.support.output import (
     print_json,
     say,
 )
-from dataflow.cli.support.run_options import LiveEffects, Paranoid, Quiet
+from dataflow.cli.support.run_options import MakeEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -118,7 +118,7 @@ def verify(
     ] = None,
     jobs: _Jobs = None,
     repeat: _Repeat = 1,
-    live_effects: LiveEffects = False,
+    make_effects: MakeEffects = False,
     paranoid: Paranoid = False,
     why: Annotated[
         bool,
@@ -195,7 +195,7 @@ def verify(
                 "start": start,
                 "jobs": 1 if one_process else jobs,
                 "paranoid": paranoid,
-                "live_effects": live_effects,
+                "make_effects": make_effects,
             }
             found = recordings_in(recordings)
             single = len(recordings) == 1 and recordings[0] == found[0][0]

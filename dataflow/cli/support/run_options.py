@@ -127,10 +127,10 @@ Live = Annotated[
 Paranoid = Annotated[
     bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
 ]
-LiveEffects = Annotated[
+MakeEffects = Annotated[
     bool,
     typer.Option(
-        "--live-effects",
+        "--make-effects",
         metavar=FLAG,
         help="Make calls to services (`self.effect`) again. Their answers are compared, and the recorded ones given; a "
         "call that is not recorded gets the new one.",

@@ -53,15 +53,15 @@ class Journal:
 
 
 class RecordedJournal(Journal):
-    """Gives recorded answers. With `live`, calls are made again and compared, and a miss gets the new answer.
+    """Gives recorded answers. With `make`, calls are made again and compared, and a miss gets the new answer.
 
     `counts`: by name of a call and what was done.
     """
 
-    def __init__(self, *, live: bool = False) -> None:
+    def __init__(self, *, make: bool = False) -> None:
         super().__init__()
         self.counts: Counter[tuple[str, str]] = Counter()
-        self._live = live
+        self._make = make
         self._left: list[tuple[Key, Answer]] = []
 
     def begin(self, detail: Mapping[str, Any]) -> None:
@@ -84,14 +84,14 @@ class RecordedJournal(Journal):
             return self._miss(key, call, args, kwargs)
         _, answer = self._left.pop(found)
         self.counts[key.name, GIVEN] += 1
-        if self._live:
+        if self._make:
             self.counts[key.name, AGAIN] += 1
             self.counts[key.name, SAME] += Answer.of(key.name, call, args, kwargs, MAX_EFFECT_BYTES) == answer
         return answer.value()
 
     def _miss(self, key: Key, call: Call, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         self.counts[key.name, MISSED] += 1
-        if self._live:
+        if self._make:
             return Answer.of(key.name, call, args, kwargs, MAX_EFFECT_BYTES).value()
         why = key.differing([recorded for recorded, _ in self._left])
         number = self._before + self.asked - 1

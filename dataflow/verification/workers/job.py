@@ -26,7 +26,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     `incomplete` (recorded streams to be made again), `records` (see `FiringLog.to_wire`), `begin` (stamp, or None),
     `tolerance`, `slices` (by operator the stamps between which its calls are made), `until` (by operator a first
     difference, as `retrial.First`, or None: once each has differed, and not first so, the rest is left), `guard` (watch
-    over messages in every call), `live_effects` (make them again), `in_turn` (operators called in the run's order).
+    over messages in every call), `make_effects` (make them again), `in_turn` (operators called in the run's order).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
     stream, `stored`, CPU time of `reading` (ns), `wall` in seconds without set-up; `slices`: those of each operator;
     `reached`: see `MemoryGuard`.
@@ -54,7 +54,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             read=read,
             guard=guard,
             watcher=board,
-            **{option: request[option] for option in ("begin", "slices", "live_effects", "in_turn")},
+            **{option: request[option] for option in ("begin", "slices", "make_effects", "in_turn")},
         )
         until = [(work.runners[name].result, first) for name, first in request["until"].items()]
         results = work.run(until=lambda: bool(until) and all(_differs(*one) for one in until))
