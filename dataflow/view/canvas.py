@@ -56,6 +56,8 @@ class Canvas:
             frame = NAMELESS
         if frame != self.plane:
             self.scene.see(self.recording, frame, self.stamp)
+        if path.startswith("space"):
+            self.begin("space")
         self._begin(path, frame)
         self.log(path, rr.CoordinateFrame(frame), *archetypes)
 
@@ -68,6 +70,10 @@ class Canvas:
         self.log(path, rr.CoordinateFrame(frame))
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(self.stamp, "ns"))
 
+    def begin(self, part: str) -> None:
+        """Notes that a part of the stream is drawn (`space`, `plot/NAME`), so that it gets its view."""
+        self.scene.new_parts |= self.scene.changed(self.entity, part, True)
+
     def clear(self, path: str) -> None:
         """Takes away what was drawn at `<entity>/<path>` before, and below."""
         if not self.static:
@@ -78,7 +84,7 @@ class Canvas:
         where = f"plot/{path}"
         if not len(values):
             return
-        self.scene.new_curves |= (self.entity, where) not in self.scene.remembered
+        self.scene.new_parts |= (self.entity, where) not in self.scene.remembered
         if self.scene.changed(self.entity, where, tuple(names)):
             paint = colors.AXES if len(names) == 3 else colors.of_classes(names)
             self.log(where, rr.SeriesLines(names=list(names), colors=paint), static=True)

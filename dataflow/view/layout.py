@@ -65,7 +65,7 @@ class Layout:
     - `aside`: truth that is drawn but switched off: scenes, surfaces, and boxes where others are estimated.
     - `kept`: clouds whose points stay where they were seen.
     - `placing`: streams that are not shown, and of which only the frames that they place are taken.
-    - `silent`: streams and the curves of theirs that have drawn nothing so far.
+    - `empty`: streams and the parts of theirs (`space`, `plot/NAME`) that have drawn nothing so far.
     - `panels`: the parts of the window that the graph asks for; none: all.
     """
 
@@ -77,7 +77,7 @@ class Layout:
     panels: tuple[str, ...] = ()
     kept: frozenset[str] = frozenset()
     placing: frozenset[str] = frozenset()
-    silent: frozenset[tuple[str, str]] = frozenset()
+    empty: frozenset[tuple[str, str]] = frozenset()
 
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
