@@ -85,11 +85,7 @@ def show(
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
     if json:
-        content = as_json(graph, activities)
-        if matches is not None:
-            content["query"] = query
-            content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
-        typer.echo(jsonlib.dumps(content))
+        _print_json(graph, activities, query, matches)
     elif nodes:
         _show(graph, since)
     elif matches is None:
@@ -100,6 +96,14 @@ def show(
             Console().print(f"nothing at {since:.1f} s is {query}", highlight=False)
     if matches is not None and not matches:
         raise typer.Exit(1)
+
+
+def _print_json(graph: SceneGraph, activities: Activity | None, query: str | None, matches: list[Match] | None) -> None:
+    content = as_json(graph, activities)
+    if matches is not None:
+        content["query"] = query
+        content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
+    typer.echo(jsonlib.dumps(content))
 
 
 def _answer(graph: SceneGraph, matches: list[Match]) -> None:

@@ -82,8 +82,11 @@ def demo(
             json=json,
             quiet=quiet,
         )
-    if json:
-        return
+    if not json:
+        _print_next(recording, outputs)
+
+
+def _print_next(recording: Path, outputs: Outputs) -> None:
     if outputs.view_file is not None:
         out.print(Text(f"look at it where there is a display: rerun {outputs.view_file}"), soft_wrap=True)
     again = f"dataflow replay {recording} --graph {GRAPH} --record demo.mcap"

@@ -169,21 +169,12 @@ def verify(
         if not 1 <= repeat <= MOST_RUNS:
             raise fail(f"--repeat {repeat}: expected 1 to {MOST_RUNS}")
         _refuse_what_excludes(first, only, graph, settings, tolerance, start, baseline, accept=accept)
-        for target in recordings:
-            if not target.is_dir():
-                existing(target, "a recording")
-        if junit is not None:
-            output_file(junit, ".xml", overwrite=True, option="--junit")
-        if baseline is not None:
-            output_file(baseline, ".json", overwrite=True, option="--baseline")
+        _check_files(recordings, junit, baseline)
         with early_workers(1 if one_process else jobs) as early:  # while this process imports what it needs itself
             from dataflow.graph import load_graph
-            from dataflow.verification.gate import Baseline, BaselineError, recordings_in
+            from dataflow.verification.gate import recordings_in
 
-            try:
-                known = None if baseline is None else Baseline.load(baseline)
-            except BaselineError as error:
-                raise fail(str(error)) from None
+            known = None if baseline is None else _loaded(baseline)
             find_modules_in(path)
             loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
             options: dict[str, Any] = {
@@ -241,6 +232,25 @@ def _refuse_what_excludes(
         raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
     if accept and (first is not None or only is not None):
         raise fail("--accept takes whole recordings: leave --from and --only out")
+
+
+def _check_files(recordings: list[Path], junit: Path | None, baseline: Path | None) -> None:
+    for target in recordings:
+        if not target.is_dir():
+            existing(target, "a recording")
+    if junit is not None:
+        output_file(junit, ".xml", overwrite=True, option="--junit")
+    if baseline is not None:
+        output_file(baseline, ".json", overwrite=True, option="--baseline")
+
+
+def _loaded(file: Path) -> Baseline:
+    from dataflow.verification.gate import Baseline, BaselineError
+
+    try:
+        return Baseline.load(file)
+    except BaselineError as error:
+        raise fail(str(error)) from None
 
 
 def _check(
