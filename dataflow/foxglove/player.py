@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dataflow.recording import Recorded
 
 if TYPE_CHECKING:
-    from dataflow.view.playback import RecordedStreams
+    from dataflow.view.recordings import RecordedStreams
 
 LOOK_BACK = (500_000_000, 5_000_000_000)
 """Spans before a place (ns) in which each stream's last message is looked for: the near one first: it is quick."""

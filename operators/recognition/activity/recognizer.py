@@ -27,7 +27,7 @@ _SPAN = 0.5  # seconds
 _DOUBT = 0.01  # what a look leaves to an activity at least
 
 
-class Looks(Remembered):
+class PostureWindow(Remembered):
     """Looks at a posture in the last half second; each gives probabilities of activities."""
 
     _taken: deque[tuple[float, F32]]
@@ -67,7 +67,7 @@ class _Agent:
     stepped: int | None
     activity: str
     since: int
-    looks: Looks
+    looks: PostureWindow
 
 
 @dataclass
@@ -151,7 +151,7 @@ class ActivityRecognizer(Operator):
         return self._answer(nodes.stamp, agents, vectors, seen)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Looks())
+        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, PostureWindow())
 
     def _looks(self, postures: Classification) -> dict[int, NDArray[np.float32]]:
         """Returns what each posture speaks for, by ids: probabilities (C,) of our activities.
