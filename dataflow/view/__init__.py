@@ -21,7 +21,7 @@ else:
         {
             "canvas": ("Canvas", "visualizer"),
             "drawing": ("visualize",),
-            "playback": ("as_alarm", "from_recording"),
+            "recordings": ("as_alarm", "from_recording"),
             "process": ("ViewerError",),
             "scene": ("SceneState", "ViewOptions"),
             "sink": ("SinkStatistics", "ViewerSink"),

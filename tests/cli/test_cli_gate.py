@@ -258,8 +258,6 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
         (["--jobs", "0"], "--jobs 0: expected 1 to"),
-        (["--jobs", "2"], "--jobs 2: expected 1 to 1024, without --one-process"),
-        (["--process-each"], "--one-process and --process-each exclude each other"),
         (["--start", "1", "--baseline", "b.json"], "--start and --baseline exclude each other"),
         (["--start", "nan"], "--start nan: expected seconds"),
         (["--start", "inf"], "--start inf: expected seconds"),
