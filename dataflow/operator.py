@@ -317,7 +317,7 @@ class Source(Operator, abstract=True):
         """Called on another thread when a live run ends: makes a `stream()` that waits for its device return."""
 
     def length(self) -> int | None:
-        """Tells how many times `stream()` will yield, if known: for progress bars."""
+        """Returns how many times `stream()` will yield, if known: for progress bars."""
         return None
 
 

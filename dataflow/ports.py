@@ -217,7 +217,7 @@ class OperatorSpec:
 
     @cached_property
     def takes_context(self) -> bool:
-        """Tells whether `process()` has a parameter named `context`."""
+        """Returns whether `process()` has a parameter named `context`."""
         return "context" in self.process_takes
 
     @cached_property
@@ -242,5 +242,5 @@ class Context:
 
 
 def is_tunable(field: FieldInfo) -> bool:
-    """Says whether a parameter may be changed while the graph runs."""
+    """Returns whether a parameter may be changed while the graph runs."""
     return isinstance(field.json_schema_extra, dict) and bool(field.json_schema_extra.get("tunable"))

@@ -46,7 +46,7 @@ class Clock:
             self._changed.notify_all()
 
     def state(self) -> tuple[bool, int, float]:
-        """Tells whether it plays, the stamp it is at, and its speed."""
+        """Returns whether it plays, the stamp it is at, and its speed."""
         with self._changed:
             return self._playing, self._place(), self._speed
 

@@ -36,7 +36,7 @@ class Canvas:
 
     @property
     def static(self) -> bool:
-        """Tells whether the message holds for all time."""
+        """Returns whether the message holds for all time."""
         return self.stream in self.scene.layout.static
 
     @property
@@ -62,7 +62,7 @@ class Canvas:
         self.log(path, rr.CoordinateFrame(frame), *archetypes)
 
     def _begin(self, path: str, frame: str) -> None:
-        """Says from the beginning on in which frame a path is drawn: a viewer asks also where nothing is yet."""
+        """Logs from the beginning on in which frame a path is drawn: a viewer asks also where nothing is yet."""
         begin = self.scene.begin
         if self.static or begin is None or begin >= self.stamp or not self.scene.changed(self.entity, f"/{path}", True):
             return
@@ -95,12 +95,12 @@ class Canvas:
         self.log("log", rr.TextLog(text, level=level))
 
     def notice(self, text: str, level: str = "WARN") -> None:
-        """Tells people once that this stream is not shown as it is."""
+        """Logs once that this stream is not shown as it is."""
         if self.scene.once(self.stream, text):
             self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level=level))
 
     def place_frames(self, message: Message) -> None:
-        """Says where the frames lie that a message places, and draws nothing."""
+        """Places the frames of a message, and draws nothing."""
         match message:
             case Transforms():
                 for frame, child, T in zip(message.frames, message.child_frames, message.matrices(), strict=True):
@@ -109,7 +109,7 @@ class Canvas:
                 self.place(message.frame, message.child_frame, message.matrix())
 
     def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
-        """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
+        """Places `child` by `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
 
         What cannot be (a frame within itself) is not drawn, and said once.
         """

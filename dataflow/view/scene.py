@@ -155,7 +155,7 @@ class SceneState:
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
 
     def changed(self, entity: str, key: str, value: object) -> bool:
-        """Tells whether `value` differs from what was last remembered under (entity, key); remembers it."""
+        """Returns whether `value` differs from what was last remembered under (entity, key); remembers it."""
         if self.remembered.get((entity, key), self) == value:
             return False
         self.remembered[entity, key] = value
@@ -166,7 +166,7 @@ class SceneState:
         return (entity_of(stream), path) in self.remembered
 
     def due(self, entity: str, stamp: int) -> bool:
-        """Tells whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""
+        """Returns whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""
         last = self.remembered.get((entity, "pose"))
         if last is not None and 0 <= stamp - last < self.options.pose_step:
             return False

@@ -164,7 +164,7 @@ class ViewerSink:
         return SinkStatistics(*(self._counts[what] for what in ("drawn", "dropped", "failed", "passed")))
 
     def backlog(self) -> int:
-        """Tells how many messages wait to be drawn."""
+        """Returns how many messages wait to be drawn."""
         return len(self._backlog)
 
     def close(self, timeout: float = 10.0) -> bool:
@@ -321,7 +321,7 @@ class ViewerSink:
 
 
 def _options(target: Target, graph: Graph | None) -> ViewOptions:
-    """Tells what a file holds, by the graph's wish too; anything else shows all."""
+    """Returns what a file holds, by the graph's wish too; anything else shows all."""
     if not isinstance(target, Save):
         return ViewOptions()
     every = graph.view.every if graph is not None else None

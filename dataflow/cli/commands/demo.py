@@ -95,7 +95,7 @@ def _print_next(recording: Path, outputs: Outputs) -> None:
 
 
 def _announced(recording: Path, graph: Graph, duration: float, *, in_real_time: bool) -> tuple[int, int] | None:
-    """Says how long it takes; returns the first and the last stamp (ns) that are played."""
+    """Prints how long it takes; returns the first and the last stamp (ns) that are played."""
     from dataflow.recording import Recording
     from dataflow.supervision.replay import plan_replay
 

@@ -83,7 +83,7 @@ def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
 
 
 def _kind(key: str) -> str:
-    """Tells which plot a value belongs to: the same unit, more or less."""
+    """Returns which plot a value belongs to: the same unit, more or less."""
     lower = key.lower()
     if _RATE.search(lower):
         return "rate"

@@ -79,7 +79,7 @@ class State(Counts):
 
 
 class ActivityRecognizer(Operator):
-    """Says what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
+    """Recognises what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
 
     A vector of an agent's motion in the last 2.5 s, its extent and the seats, tables and drinks around it goes at each
     graph into two LSTM layers. Their state is kept for as long as the agent is in the scene, and goes on by steps of

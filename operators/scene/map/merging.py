@@ -22,14 +22,14 @@ _SELDOM = 0.15  # share of the views in which both are seen beside each other, f
 
 
 def may_be_one(cells: Sequence[Cells], rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Tells of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
+    """Returns of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
     low, high = (np.array([each.bounds[side] for each in cells]) for side in (0, 1))
     apart = np.maximum(low[rows, None], low[None]) - np.minimum(high[rows, None], high[None])
     return np.asarray(apart.max(axis=2) <= _NEAR_MOVERS)
 
 
 def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
-    """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
+    """Returns whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
     apart = a.cells.apart(b.cells)
     if apart > _NEAR_MOVERS:
         return False

@@ -82,7 +82,7 @@ def followed_graph(name: str | None, wait: float) -> RunningGraph:
 
 
 def say_followed(found: RunningGraph) -> None:
-    """Says which running graph a command follows."""
+    """Prints which running graph a command follows."""
     say(f"following {escape(found.name)} (process {found.pid})")
 
 
