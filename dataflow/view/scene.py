@@ -185,7 +185,7 @@ class SceneState:
         return Rank.TRUTH if is_truth(stream) else Rank.ESTIMATE
 
     def trail_color(self, stream: str, streams: tuple[str, ...]) -> colors.RGB:
-        """Green for ground truth; else by the place of the stream among `streams`, those of its kind."""
+        """Returns green for ground truth, otherwise a palette colour by the place of the stream among `streams`."""
         if is_truth(stream):
             return colors.TRUTH
         others = [name for name in streams if not is_truth(name)]
