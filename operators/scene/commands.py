@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -31,6 +32,9 @@ _OLD = 1.0
 
 _LIKEST = 10
 """Nodes that a question by meaning is answered with."""
+
+_PIPED = 160
+"""Columns of a table that no terminal shows."""
 
 scene = typer.Typer(name="scene", add_completion=False)
 
@@ -241,10 +245,12 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
 
 def _show(graph: SceneGraph, since: float) -> None:
     out, names = Console(), graph.names()
+    out = out if out.is_terminal else Console(width=_PIPED)
     scores = graph.relation_scores
-    table = Table(title=f"{graph.count} nodes at {since:.1f} s in {graph.frame}", title_justify="left")
+    title = f"{graph.count} nodes at {since:.1f} s in {graph.frame}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in ("node", "score", "position, m", "size, m", "tracks", "relations"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column not in ("tracks", "relations"))
     for k in range(graph.count):
         held = [
             f"{p.replace('_', ' ')} {names[o]}" + ("" if scores is None else f" {scores[j]:.2f}")
