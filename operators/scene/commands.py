@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -31,6 +32,9 @@ _OLD = 1.0
 
 _LIKEST = 10
 """Nodes that a question by meaning is answered with."""
+
+_PIPED = 160
+"""Columns of a table that no terminal shows."""
 
 scene = typer.Typer(name="scene", add_completion=False)
 
@@ -85,11 +89,7 @@ def show(
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
     if json:
-        content = as_json(graph, activities)
-        if matches is not None:
-            content["query"] = query
-            content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
-        typer.echo(jsonlib.dumps(content))
+        _print_json(graph, activities, query, matches)
     elif nodes:
         _show(graph, since)
     elif matches is None:
@@ -100,6 +100,14 @@ def show(
             Console().print(f"nothing at {since:.1f} s is {query}", highlight=False)
     if matches is not None and not matches:
         raise typer.Exit(1)
+
+
+def _print_json(graph: SceneGraph, activities: Activity | None, query: str | None, matches: list[Match] | None) -> None:
+    content = as_json(graph, activities)
+    if matches is not None:
+        content["query"] = query
+        content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
+    typer.echo(jsonlib.dumps(content))
 
 
 def _answer(graph: SceneGraph, matches: list[Match]) -> None:
@@ -238,10 +246,12 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
 
 def _show(graph: SceneGraph, since: float) -> None:
     out, names = Console(), graph.names()
+    out = out if out.is_terminal else Console(width=_PIPED)
     scores = graph.relation_scores
-    table = Table(title=f"{graph.count} nodes at {since:.1f} s in {graph.frame}", title_justify="left")
+    title = f"{graph.count} nodes at {since:.1f} s in {graph.frame}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in ("node", "score", "position, m", "size, m", "tracks", "relations"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column not in ("tracks", "relations"))
     for k in range(graph.count):
         held = [
             f"{p.replace('_', ' ')} {names[o]}" + ("" if scores is None else f" {scores[j]:.2f}")

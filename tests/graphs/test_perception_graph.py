@@ -61,7 +61,7 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
     assert len(corrected) == len(mounted) == 1
     joints, postures = (recorded[f"robot1/perception/{each}"] for each in ("keypoints/keypoints", "skeletons/postures"))
     assert len(joints) == len(postures) > 5
-    assert json.loads(run("verify", file, "--one-process", "--json", "-q"))["identical"] is True
+    assert json.loads(run("verify", file, "--jobs", "1", "--json", "-q"))["identical"] is True
     shown = json.loads(CliRunner().invoke(scene, [str(file), "--json"]).stdout)
     assert {n["name"] for n in shown["nodes"]} >= {"room", "self", "floor"}
     assert any(n["class"] == "bin" for n in shown["nodes"])

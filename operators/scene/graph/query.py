@@ -43,7 +43,7 @@ _LAYERS = {ROOM: "room", FLOOR: "surface", ROBOT: "robot"}
 
 
 class QueryError(ValueError):
-    """Tells what in a question is not understood, and what would be."""
+    """Explains what in a question is not understood, and what would be."""
 
 
 @dataclass(frozen=True)
