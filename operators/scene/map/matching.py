@@ -118,7 +118,7 @@ def alike(
 
 
 def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
-    """Returns of observations (N) and boxes (M, 7), centre, size and heading, which are not too far apart to be `alike`.
+    """Returns which of the observations (N) are near enough to boxes (M, 7), centre, size, heading, to be `alike`.
 
     A micrometre more passes: `alike` decides.
     """
