@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from dataflow.api.recordings import open as open_recording
 from dataflow.messages import Activity, FeatureVector, SceneGraph
 from dataflow.messages.scene_summary import (
     agents_in_words,
@@ -22,6 +23,7 @@ from dataflow.messages.scene_summary import (
     summarize,
 )
 from dataflow.recording import Recording, RecordingError
+from operators.labels import LabelSpace, LabelSpaceError, labels_file
 from operators.scene.graph.history import Event, history
 from operators.scene.graph.meaning import by_meaning, how_to_embed
 from operators.scene.graph.query import Match, QueryError, as_json, ask
@@ -120,12 +122,12 @@ def _answer(graph: SceneGraph, matches: list[Match]) -> None:
 
 def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> list[Match]:
     """Returns what fits a question, or, where that is none of classes and relations, what is like it in meaning."""
-    try:
-        return ask(graph, query)
-    except QueryError as error:
-        reason = str(error)
     with _opened(path) as recording:
         built, _ = _built(recording, stream)
+        try:
+            return ask(graph, query, _labels(path, built))
+        except QueryError as error:
+            reason = str(error)
         room = built.rpartition("/")[0].rpartition("/")[0]
         known = [n for n, info in recording.streams.items() if info.message_type is FeatureVector]
         means = [n for n in known if n.endswith("/means") and n.startswith(f"{room}/" if room else "")]
@@ -138,6 +140,20 @@ def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> lis
         matches = by_meaning(graph, vectors, query)[:_LIKEST]
     Console(stderr=True).print(f"note: by meaning, since {reason}", highlight=False, soft_wrap=True, markup=False)
     return matches
+
+
+def _labels(path: Path, built: str) -> LabelSpace:
+    """Returns the label space of the operator that made the graph; one without entries where its file is not here."""
+    with open_recording(path) as recording:
+        run = recording.graph
+    maker = None if run is None or built not in run.streams else run.nodes[run.streams[built].node]
+    given = "" if maker is None else str(maker.params.get("labels", ""))
+    try:
+        return LabelSpace.read(Path(labels_file(given))) if given else LabelSpace("none")
+    except (OSError, LabelSpaceError) as error:
+        note = f"note: classes have no other names here, since their label space cannot be read: {error}"
+        Console(stderr=True).print(note, highlight=False, soft_wrap=True, markup=False)
+        return LabelSpace("none")
 
 
 def _write(graph: SceneGraph, file: Path, *, overwrite: bool) -> None:

@@ -106,6 +106,18 @@ def test_boxes_of_any_detector_reach_the_map_and_the_tracks_unchanged(name: str)
         assert nodes[f"perception/{consumer}"].inputs["detections"] == (detector,)
 
 
+@pytest.mark.parametrize(
+    ("name", "word"), [("perception", "perception."), ("perception_rgbd", ""), ("perception_kitti", "")]
+)
+def test_boxes_with_masks_reach_the_map_and_the_tracks_where_they_are_asked_for(name: str, word: str) -> None:
+    words = [f"{word}masks=true", f"{word}masker=own.onnx"]
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=words).nodes
+    assert nodes["perception/masks"].params["model"] == "own.onnx"
+    assert nodes["perception/masks"].inputs["detections"] == ("robot1/perception/detector/detections",)
+    for consumer in ("lifter", "tracker"):
+        assert nodes[f"perception/{consumer}"].inputs["detections"] == ("robot1/perception/masks/masked",)
+
+
 @pytest.mark.parametrize("name", ["perception", "perception_given", "perception_rgbd", "perception_kitti"])
 def test_one_setting_gives_every_operator_the_label_space(name: str) -> None:
     nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=["labels=own.yaml"]).nodes
