@@ -222,7 +222,7 @@ def _tables(scene: SceneGraph) -> set[int]:
 
 
 def _covers(top: Box, table: Box) -> bool:
-    """Tells whether half of a table's footprint is under a surface at its height."""
+    """Returns whether half of a table's footprint is under a surface at its height."""
     high = table[0][2] + table[1][2] / 2
     flat = (np.array([*table[0][:2], 0]), np.array([*table[1][:2], 1.0]), table[2])
     own = (np.array([*top[0][:2], 0]), np.array([*top[1][:2], 1.0]), top[2])

@@ -59,7 +59,7 @@ def macro_f1(counts: Counter[str]) -> float:
 
 
 def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]]:
-    """Tells for each arrival whether the true goal was first one second before: ours, the nearest, that ahead."""
+    """Returns for each arrival whether the true goal was first one second before: ours, the nearest, that ahead."""
     found: dict[str, list[bool]] = {"ours": [], "nearest": [], "heading": []}
     last: dict[int, str] = {}
     for k, frame in enumerate(frames):

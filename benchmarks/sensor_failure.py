@@ -97,7 +97,7 @@ def turned(extrinsics: Transforms, frame: str, axis: str) -> Transforms:
 
 
 def there(sensor: str, kind: str) -> bool:
-    """Tells whether a sensor has such a fault."""
+    """Returns whether a sensor has such a fault."""
     if kind in ("turned", "tilted"):
         return f"{sensor} {kind}" in TURNED
     return kind != "misscaled" or sensor in MISSCALED

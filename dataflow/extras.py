@@ -15,6 +15,7 @@ _OF_MODULES = {
     "small_gicp": "small-gicp",
 }
 """Module → distribution, where the names differ."""
+INSTALL = "it comes with: pip install"
 _COLLECTIONS = ("all", "dev")
 _BY_CALLER = {
     "operators.": "perception",
@@ -32,7 +33,7 @@ def missing_extra(error: BaseException | None) -> str:
     while error is not None:
         if isinstance(error, ModuleNotFoundError) and error.name:
             extras = _extras().get(_distribution(error.name), ())
-            return f"it comes with: pip install '{DISTRIBUTION}[{_chosen(extras, error)}]'" if extras else ""
+            return f"{INSTALL} '{DISTRIBUTION}[{_chosen(extras, error)}]'" if extras else ""
         error = error.__cause__ or error.__context__
     return ""
 

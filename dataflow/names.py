@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def firings_key(namespace: str, operator: str) -> str:
-    """Tells where an operator's firing records travel and are recorded."""
+    """Returns where an operator's firing records travel and are recorded."""
     return f"{namespace}/@/firings/{operator}"
 
 

@@ -128,10 +128,6 @@ class Operator:
             tolerance = above.tolerance if tolerance is None else tolerance
             every = above.every if every is None else every
         if not abstract:
-            if issubclass(cls, Source) and isinstance(vars(cls).get("live"), bool):
-                raise OperatorDefinitionError(
-                    f"{cls.__name__}.live was renamed: a source that cannot wait is real_time"
-                )
             declared = Declaration(cls, (Operator, Source), sys._getframe(1).f_locals)
             if declared.state is not None:
                 cls.state = StateOf()
@@ -321,7 +317,7 @@ class Source(Operator, abstract=True):
         """Called on another thread when a live run ends: makes a `stream()` that waits for its device return."""
 
     def length(self) -> int | None:
-        """Tells how many times `stream()` will yield, if known: for progress bars."""
+        """Returns how many times `stream()` will yield, if known: for progress bars."""
         return None
 
 

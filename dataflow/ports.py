@@ -128,15 +128,12 @@ def Param(
     pattern: str | None = None,
     unit: str = "",
     tunable: bool = False,
-    live: None = None,
 ) -> Any:
     """Declares a parameter with its default, bounds and documentation. Without a default it must be given.
 
     `tunable`: it may be changed while the graph runs (`dataflow param set`): `process()` reads `self.<name>` anew each
-    time, or `on_parameter` does what else is needed. Raises TypeError for `live`, its name in the past.
+    time, or `on_parameter` does what else is needed.
     """
-    if live is not None:
-        raise TypeError("Param(live=...) was renamed: a parameter that changes while the graph runs is tunable=True")
     info = pydantic.Field(
         default,
         description=doc,
@@ -242,5 +239,5 @@ class Context:
 
 
 def is_tunable(field: FieldInfo) -> bool:
-    """Says whether a parameter may be changed while the graph runs."""
+    """Returns whether a parameter may be changed while the graph runs."""
     return isinstance(field.json_schema_extra, dict) and bool(field.json_schema_extra.get("tunable"))

@@ -21,12 +21,12 @@ GENERATED = ("docs/api.md", "docs/messages.md", "docs/operators.md")
 PATTERNS = {
     "a person for a process or caller": re.compile(r"\b(?:some|no|any)body\b|\bwhoever\b", re.I),
     "of its own": re.compile(r"\bof (?:its|their|one's|your) own\b", re.I),
-    "a function that speaks or thinks": re.compile(r"\b(?:tells|says|hears|knows)\b"),
+    "a function that speaks or thinks": re.compile(r"\b(?:tells|says|hears|knows)\b", re.I),
     "cleft sentence": re.compile(
         r"(?:^|[.:;] )What (?:[^.?`]|`[^`]*`)*\b(?:is|are|was|were)\b(?:[^.?`]|`[^`]*`)*\.", re.M
     ),
 }
-HINT = re.compile(r"(?i:some|no|any)body\b|(?i:whoever)|\b(?i:own)\b|\b(?:tells|says|hears|knows)\b|What ")
+HINT = re.compile(r"(?i:some|no|any)body\b|(?i:whoever)|\b(?i:own)\b|\b(?i:tells|says|hears|knows)\b|What ")
 """Occurs in every file in which a pattern matches: a file without it is not taken apart."""
 
 

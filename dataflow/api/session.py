@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from dataflow.api.graphs import GraphLike, resolved
-from dataflow.api.handed import HandedFeed
 from dataflow.api.local import Emitting, Recorder, config_of
+from dataflow.api.memory_feed import MemoryFeed
 from dataflow.api.runs import metadata_of
 from dataflow.arguments import checked, require
 from dataflow.execution.calls import summary_of
@@ -60,7 +60,7 @@ class Session:
         self._made: dict[str, list[Message]] = {}
         self._driver = Driver()
         self._emitter = _Collecting(self._driver, self._names, self._made)
-        self._feed = HandedFeed(self.graph, static or {}, self._emitter)
+        self._feed = MemoryFeed(self.graph, static or {}, self._emitter)
         self._closed = False
         self._outcome = "failed: it did not end in order"
         self._open = ExitStack()

@@ -65,7 +65,7 @@ class RecordedStream(Sequence[Message]):
 
     @property
     def partial(self) -> bool:
-        """Tells whether this is a part of the stream."""
+        """Returns whether this is a part of the stream."""
         return self._chosen is not None
 
     @cached_property

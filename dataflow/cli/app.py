@@ -21,7 +21,7 @@ from dataflow.cli.support.output import (
     interrupted_by_user,
     wants_traceback,
 )
-from dataflow.cli.support.plugins import CommandGroup, renamed
+from dataflow.cli.support.plugins import CommandGroup
 from dataflow.cli.support.standard_output import OutputFailed
 from dataflow.extras import missing_extra
 
@@ -32,7 +32,9 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["--help", "-h"], "token_normalize_func": renamed},
+    context_settings={
+        "help_option_names": ["--help", "-h"],
+    },
 )
 
 

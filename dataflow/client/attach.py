@@ -157,7 +157,7 @@ def types_of(graph: Graph) -> TypeOf:
 
 
 def still_runs(found: RunningGraph) -> bool:
-    """Tells whether that very run goes on. Raises `Lost` for one of another machine that is not heard for too long."""
+    """Returns whether that very run goes on. Raises `Lost` for one of another machine that is silent for too long."""
     if (place := _elsewhere.get()) is not None:
         return place.still_runs(found)
     return any(g.pid == found.pid and g.started == found.started for g in running())

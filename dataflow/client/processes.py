@@ -91,7 +91,7 @@ class Processes:
         self._bus, self._namespace = bus, namespace
 
     def connected(self, number: int, timeout: float) -> bool:
-        """Tells whether so many processes are reached by now."""
+        """Returns whether so many processes are reached by now."""
         deadline = time.monotonic() + timeout
         while len(self._bus.peers()) < number:
             if time.monotonic() > deadline:

@@ -101,7 +101,7 @@ class AttachedRecorder:
 
     @property
     def ended(self) -> bool:
-        """Tells whether every stream has ended."""
+        """Returns whether every stream has ended."""
         moving = {s for s in self._streams if not self._graph.streams[s].static}
         return bool(moving) and moving <= self._ends.keys()
 

@@ -44,7 +44,7 @@ class ReplayBar:
         return refused
 
     def state(self) -> tuple[bool, int, float]:
-        """Tells whether it plays, the stamp it is at, and its speed."""
+        """Returns whether it plays, the stamp it is at, and its speed."""
         with self._guard:
             stamp = self._standing["stamp"]
             playing = not self._standing["paused"] and not self._standing["ended"]
@@ -52,7 +52,7 @@ class ReplayBar:
 
     @property
     def ended(self) -> bool:
-        """Tells whether everything has been given."""
+        """Returns whether everything has been given."""
         with self._guard:
             return bool(self._standing["ended"])
 

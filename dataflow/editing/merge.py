@@ -98,7 +98,7 @@ def prefixed(prefix: str, name: str) -> str:
 
 
 def are_of_one_run(origins: Sequence[Origin]) -> bool:
-    """Tells whether recordings hold parts of one run: the same run of the same graph, by what they say of it."""
+    """Returns whether recordings hold parts of one run: the same run of the same graph, by what they say of it."""
     said = [[o.metadata.get(name) for name in (RUN, GRAPH, RECORDING)] for o in origins]
     return len(origins) > 1 and said[0][0] is not None and all(one == said[0] for one in said)
 
@@ -214,7 +214,7 @@ def _refuse_clashes(origins: Sequence[Origin], prefixes: Sequence[str]) -> None:
 
 
 def _tell_clocks(origins: Sequence[Origin], done: Edited) -> None:
-    """Says when each was recorded, and that streams of different times or clocks do not meet."""
+    """Prints when each was recorded, and that streams of different times or clocks do not meet."""
     spans = [(origin, span) for origin in origins if (span := origin.span()) is not None]
     for origin, (first, last) in spans:
         done.notes.append(f"{origin.path.name}: {format_stamp(first)} to {format_stamp(last)}")

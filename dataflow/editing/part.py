@@ -45,7 +45,7 @@ class Part:
 
     @property
     def cuts(self) -> bool:
-        """Tells whether it leaves out anything before or after the span."""
+        """Returns whether it leaves out anything before or after the span."""
         return self.start is not None or self.end is not None
 
     def span(self, stream: str) -> Span:
@@ -211,7 +211,7 @@ def outputs_of(graph: Graph | None) -> dict[str, Sequence[str]]:
 
 
 def keeps_state(node: Node) -> bool:
-    """Tells whether an operator's calls depend on those before, as far as it can be known here."""
+    """Returns whether an operator's calls depend on those before, as far as it can be known here."""
     try:
         return not (node.source or node.external or node.operator.stateless)
     except OperatorImportError:
@@ -269,7 +269,7 @@ def masks_of(origin: Origin, part: Part, needed: Stamps) -> dict[int, Mask]:
 
 
 def latched(origin: Origin, topic: str) -> bool:
-    """Tells whether another program's topic keeps its messages for late subscribers: they hold for the part too."""
+    """Returns whether another program's topic keeps its messages for late subscribers: they hold for the part too."""
     profiles = [c.metadata.get("offered_qos_profiles", "") for c in origin.channels.values() if c.topic == topic]
     return not origin.own and any(is_latched(topic, text) for text in profiles)
 

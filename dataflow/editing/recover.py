@@ -36,7 +36,7 @@ class Loss:
 
 @dataclass(slots=True)
 class Recovered:
-    """Tells what was saved into a file, and what is lost.
+    """Summarises what was saved into a file, and what is lost.
 
     `torn`: the broken file had no proper end; `lost_bytes`: of the unfinished record there. `damage`: for people.
     """
@@ -49,7 +49,7 @@ class Recovered:
 
     @property
     def whole(self) -> bool:
-        """Tells whether nothing is known to be lost."""
+        """Returns whether nothing is known to be lost."""
         return not (self.lost or self.lost_bytes or self.torn)
 
     def as_json(self) -> dict[str, Any]:

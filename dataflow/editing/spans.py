@@ -122,7 +122,7 @@ class RunRecords:
 
 
 class _Within:
-    """Tells whether stamps of a stream lie within its span."""
+    """Returns whether stamps of a stream lie within its span."""
 
     def __init__(self, span: Callable[[str], Span]) -> None:
         self._span = span

@@ -1,4 +1,4 @@
-"""The questions that a process asks of whatever it runs, with the answers of a runner that has nothing to say."""
+"""The base class of runners: what a process asks of the operator or source that it runs, with defaults."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dataflow.recording import Recorded
 
 if TYPE_CHECKING:
-    from dataflow.view.playback import RecordedStreams
+    from dataflow.view.recordings import RecordedStreams
 
 LOOK_BACK = (500_000_000, 5_000_000_000)
 """Spans before a place (ns) in which each stream's last message is looked for: the near one first: it is quick."""
@@ -46,7 +46,7 @@ class Clock:
             self._changed.notify_all()
 
     def state(self) -> tuple[bool, int, float]:
-        """Tells whether it plays, the stamp it is at, and its speed."""
+        """Returns whether it plays, the stamp it is at, and its speed."""
         with self._changed:
             return self._playing, self._place(), self._speed
 

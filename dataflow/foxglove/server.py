@@ -43,7 +43,7 @@ class Controls(Protocol):
         """Does what a client asks for; `seek`: the stamp to go to. Returns why it does not, where it does not."""
 
     def state(self) -> tuple[bool, int, float]:
-        """Tells whether it plays, the stamp it is at, and its speed."""
+        """Returns whether it plays, the stamp it is at, and its speed."""
 
 
 class FoxgloveServer:
@@ -99,15 +99,15 @@ class FoxgloveServer:
         self.shown += 1
 
     def time(self, stamp: int) -> None:
-        """Tells the clients which time it is."""
+        """Sends the clients which time it is."""
         self._server.broadcast_time(max(stamp, 0))
 
     def playback(self, controls: Controls, *, did_seek: bool = False, ended: bool = False) -> None:
-        """Tells the clients where the playback is."""
+        """Sends the clients where the playback is."""
         self._server.broadcast_playback_state(_state(self._sdk, controls, did_seek, ended, ""))
 
     def _refuse(self, why: str) -> None:
-        """Tells the clients why the playback bar did not do what it was asked for."""
+        """Sends the clients why the playback bar did not do what it was asked for."""
         self._server.publish_status(why, self._sdk.websocket.StatusLevel.Warning, "playback")
 
     def close(self) -> None:

@@ -187,7 +187,7 @@ def find(catalogue: Catalogue, name: str) -> Described:
 
 
 def fires(cls: type[Operator]) -> str:
-    """Tells when the operator fires, in words."""
+    """Returns when the operator fires, in words."""
     spec = cls.spec
     if is_source(cls):
         return "by itself (a device)" if getattr(cls, "real_time", False) else "by itself (can wait)"

@@ -29,7 +29,7 @@ class Pattern:
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """Says why something is not there: `reason` for people, and the prefix of the operators that do without it.
+    """Explains why something is not there: `reason` for people, and the prefix of the operators that do without it.
 
     Operators below it (`"perception/"`) were written for that; a file that leaves an input out may not name what
     would have been made of it.
@@ -120,7 +120,7 @@ class Expansion:
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """Says where in the nesting a file stands. `prefix` is "" or "front/"; `key` the absolute key prefix."""
+    """Describes where in the nesting a file stands. `prefix` is "" or "front/"; `key` the absolute key prefix."""
 
     file: str
     shown: str

@@ -14,7 +14,7 @@ _WITHIN = re.compile(r"\$\*|.", re.DOTALL)
 
 
 def name_fault(name: str) -> str | None:
-    """Tells why `name` cannot name an operator, a graph or one part of a namespace; None when it can."""
+    """Returns why `name` cannot name an operator, a graph or one part of a namespace; None when it can."""
     if _NAME.fullmatch(name):
         return None
     bad = next((c for c in name if not re.match(r"[\w-]", c)), None)
@@ -27,7 +27,7 @@ NAME_RULE = "a name is letters, digits, '_' and '-', and begins with a letter or
 
 
 def key_fault(key: str) -> str | None:
-    """Tells why a key expression (without a leading '/') is not one, in our own words; None when it is."""
+    """Returns why a key expression (without a leading '/') is not one, in our own words; None when it is."""
     if not key:
         return "it is empty"
     if key.startswith("/") or key.endswith("/") or "//" in key:

@@ -21,7 +21,7 @@ from dataflow.operator import Operator, Source
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Says why there is no operator behind a path."""
+    """Returns why there is no operator behind a path."""
 
     message: str
     hint: str = ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -35,18 +34,6 @@ if TYPE_CHECKING:  # what follows a running graph imports no operator
 QueuePolicy = Literal["newest", "oldest", "block"]
 StalePolicy = Literal["use", "drop"]
 Placement = Literal["graph", "one_process", "process_each"]
-
-FORMER_PLACEMENTS = {"one_host": "one_process", "host_each": "process_each"}
-"""Placements by their names of the version before, which still work in this one."""
-
-
-def current_placement(placement: Any) -> Any:
-    """Returns a placement by the name it has now, with a DeprecationWarning where it is called by its former one."""
-    if not isinstance(placement, str) or placement not in FORMER_PLACEMENTS:
-        return placement
-    now = FORMER_PLACEMENTS[placement]
-    warnings.warn(f"placement {placement!r} is now {now!r}", DeprecationWarning, stacklevel=3)
-    return now
 
 
 class OperatorImportError(ImportError):
@@ -355,7 +342,6 @@ class Graph:
         `placement`: as the graph's `process:` labels say, all in one process, one process each, or an explicit mapping
         from node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
         """
-        placement = current_placement(placement)
         if isinstance(placement, str) and placement not in ("graph", "one_process", "process_each"):
             raise ValueError(f"placement {placement!r}: expected graph, one_process, process_each or a mapping")
         if not isinstance(placement, str) and (unknown := sorted(placement.keys() - self.nodes.keys())):

@@ -10,6 +10,8 @@ from typing import Any, NoReturn
 
 from rich.cells import cell_len
 
+from dataflow.extras import INSTALL
+
 MAX_PROBLEMS = 100
 """Faults that are reported at most; the rest of the graph is not read."""
 MAX_MESSAGE = 2_000
@@ -94,7 +96,20 @@ class GraphError(ValueError):
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
-        super().__init__("\n".join(map(str, self.problems)))
+        super().__init__("\n".join(_texts(self.problems)))
+
+
+def _texts(problems: Sequence[Problem]) -> list[str]:
+    """Returns the problems as text; of those that installing one extra mends, the first and how many there are."""
+    texts, more = [], dict[str, int]()
+    for problem in problems:
+        if problem.hint in more:
+            more[problem.hint] += 1
+            continue
+        texts.append(str(problem))
+        if problem.hint.startswith(INSTALL):
+            more[problem.hint] = 0
+    return texts + [f"      and {count} more: {hint}" for hint, count in more.items() if count]
 
 
 @dataclass(slots=True)

@@ -30,7 +30,7 @@ class Trigger:
 class Flight:
     """A flight recorder: event time to keep before a trigger and after it (ns), where, and how many files at most.
 
-    `disk`: bytes that what is not kept yet may take; None: as much as the time needs. With less, less time is there.
+    `disk`: size limit of the ring buffer, bytes; None: as much as `keep` needs. A lower limit shortens the history.
     """
 
     keep: int

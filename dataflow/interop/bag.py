@@ -100,7 +100,7 @@ class Bag(Protocol):
 
 
 def shortfalls(bag: Bag) -> list[str]:
-    """Says of which topics a bag holds fewer messages than its metadata promise, and which of those cannot be read."""
+    """Reports the topics with fewer messages than the metadata promise, and which of them cannot be read."""
     lost = bag.lost
     return [
         *(_promise(*counts) for counts in _counts(bag) if counts[2] < counts[1]),
@@ -113,7 +113,7 @@ def shortfalls(bag: Bag) -> list[str]:
 
 
 def surpluses(bag: Bag) -> list[str]:
-    """Says of which topics a bag holds more messages than its metadata promise."""
+    """Reports of which topics a bag holds more messages than its metadata promise."""
     return [_promise(*counts) for counts in _counts(bag) if counts[2] > counts[1]]
 
 
@@ -137,7 +137,7 @@ def is_static(topic: str) -> bool:
 
 
 def is_latched(topic: str, profiles: str = "") -> bool:
-    """Tells whether a topic keeps its messages for late subscribers, by its name or the text of its QoS profiles."""
+    """Returns whether a topic keeps its messages for late subscribers, by its name or the text of its QoS profiles."""
     if is_static(topic):
         return True
     compact = profiles.lower().replace(" ", "").replace('"', "")

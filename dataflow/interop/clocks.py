@@ -71,8 +71,8 @@ class Clock:
         return np.where(times.header > 0, times.header, logged)
 
     def tells(self, times: Times) -> bool:
-        """Tells whether equal stamps of a topic, with equal content, are one message that was recorded twice: not where
-        most of its stamps are equal, as of a log that was kept in whole seconds, or without times."""
+        """Returns whether equal stamps of a topic, with equal content, are one message that was recorded twice: not
+        where most of its stamps are equal, as of a log that was kept in whole seconds, or without times."""
         return len(times.log) <= 2 * len(np.unique(self.stamps(times)))
 
 
@@ -145,7 +145,7 @@ def _pace(times: Times) -> float:
 
 
 def _stays_back(times: Times) -> bool:
-    """Tells whether the headers are later against the log by most of their largest step back from then on, as after a
+    """Returns whether the headers are later against the log by most of their largest step back from then on, as after a
     clock that was set; where single messages come late, the others stay where they were."""
     assert times.header is not None
     given = times.header > 0

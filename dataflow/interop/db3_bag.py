@@ -224,7 +224,7 @@ _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
 
 def _half_written(file: Path) -> bool:
-    """Tells whether a rollback journal beside a database waits to be played back (SQLite file format 3)."""
+    """Returns whether a rollback journal beside a database waits to be played back (SQLite file format 3)."""
     journal = file.with_name(f"{file.name}-journal")
     if not journal.is_file():
         return False

@@ -74,7 +74,7 @@ class Proposal:
 
     @property
     def settled(self) -> bool:
-        """Tells whether it can be played as it is."""
+        """Returns whether it can be played as it is."""
         return not self.guessed and not self.missing
 
     @property

@@ -78,7 +78,7 @@ def bag_at(path: Path, *, strict: bool = False) -> Bag:
 
 
 def is_foreign(path: Path) -> bool:
-    """Tells whether a file or folder is a recording of another program: anything but an MCAP that this one wrote."""
+    """Returns whether a file or folder is a recording of another program: anything but an MCAP that this one wrote."""
     if path.is_dir():
         parts = parts_in(path)
         return not parts or is_foreign(parts[0])
@@ -96,7 +96,7 @@ def is_foreign(path: Path) -> bool:
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Tells whether a file is a ROS 1 bag or a database of a ROS 2 bag, whole or not."""
+    """Returns whether a file is a ROS 1 bag or a database of a ROS 2 bag, whole or not."""
     return path.is_file() and head_of(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
 
 

@@ -38,7 +38,7 @@ class Matching:
         return [f"{m.topic}={m.wanted.name}" for m in self.proposal.matches]
 
     def explanation(self) -> str:
-        """Says why the proposal is not settled, and what would settle it."""
+        """Explains why the proposal is not settled, and what would settle it."""
         lines = [f"{self.path}: which topics feed the graph must be said with --map"]
         for wanted in self.proposal.missing:
             lines.append(f"  no topic holds what {wanted.name} takes: {' or '.join(wanted.types)}")

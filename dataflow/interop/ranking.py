@@ -84,7 +84,7 @@ class _Ahead(Iterator[tuple[int, int, int]]):
 
 
 def within(stamps: I64, start: int | None, end: int | None) -> npt.NDArray[np.bool_]:
-    """Tells which stamps lie in a span; None: it is open there."""
+    """Returns which stamps lie in a span; None: it is open there."""
     return (stamps >= (np.iinfo(np.int64).min if start is None else start)) & (
         stamps <= (np.iinfo(np.int64).max if end is None else end)
     )

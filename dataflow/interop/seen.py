@@ -1,4 +1,4 @@
-"""Tells which fields of a message of another system a conversion has not looked at, and so has not carried over."""
+"""Returns which fields of a message of another system a conversion has not looked at, and so has not carried over."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class BagStreams:
 
     @property
     def torn(self) -> bool:
-        """Tells False: which of its files has no proper end stands in `notes`."""
+        """Returns False: which of its files has no proper end stands in `notes`."""
         return False
 
     @property

@@ -184,7 +184,7 @@ def _ros_reader(topic: Topic) -> TopicReader:
 
 
 def is_known(topic: Topic) -> bool:
-    """Tells whether a topic's type has a counterpart here."""
+    """Returns whether a topic's type has a counterpart here."""
     if topic.encoding in ("cdr", "ros1"):
         return ros_type(topic.schema.name) in CONVERSIONS
     return foreign_decoder(topic.encoding, topic.schema) is not None
@@ -215,12 +215,12 @@ class Reading:
 
     @property
     def playable(self) -> bool:
-        """Tells whether its messages can stand in for a stream."""
+        """Returns whether its messages can stand in for a stream."""
         return not self.reason
 
     @property
     def merges(self) -> bool:
-        """Tells whether messages of one stamp become one."""
+        """Returns whether messages of one stamp become one."""
         return self.read_as is Transforms
 
     def _look_at(self, bag: Bag) -> None:

@@ -44,7 +44,7 @@ class RosType:
 
     @property
     def has_header(self) -> bool:
-        """Tells whether its first field is a std_msgs/Header."""
+        """Returns whether its first field is a std_msgs/Header."""
         fields = self._store.fielddefs[self.name][1]
         return bool(fields) and fields[0][1][1] == HEADER
 
@@ -91,7 +91,7 @@ def _shortly(error: Exception) -> str:
 
 
 def same_layout(encoding: str, a: SchemaText, b: SchemaText) -> bool:
-    """Tells whether two definitions, whatever their comments and constants, say the same of the bytes."""
+    """Returns whether two definitions, whatever their comments and constants, say the same of the bytes."""
     try:
         one, other = (_stores(ros_type(s.name), encoding, s)[0] for s in (a, b))
         return bool(_layout(one, ros_type(a.name)) == _layout(other, ros_type(b.name)))

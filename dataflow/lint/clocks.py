@@ -204,6 +204,6 @@ def agreed(differences: Mapping[str, ClockDifference], tolerance: float) -> str:
 
 
 def _agree(one: ClockDifference, centre: ClockDifference, tolerance: float) -> bool:
-    """Tells whether one fits a centre, as far as its own uncertainty goes: an uncertain centre would fit them all."""
+    """Returns whether one fits a centre, as far as its own uncertainty goes: an uncertain centre would fit them all."""
     apart = abs(one.offset - centre.offset) + abs(one.drift - centre.drift) * one.duration / 2
     return apart <= tolerance + 2 * one.offset_deviation + one.drift_deviation * one.duration

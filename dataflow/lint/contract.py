@@ -93,7 +93,7 @@ class Contract(_Section):
 
 
 def means(word: str, stream: str, namespace: str) -> bool:
-    """Tells whether a name or pattern of a contract means a stream."""
+    """Returns whether a name or pattern of a contract means a stream."""
     bare, key = as_expression(word.strip("/")), stream.strip("/")
     readings = (bare, f"{namespace}/{bare}") if namespace else (bare,)
     return any(matching(canonical(reading), [key]) for reading in readings)

@@ -37,7 +37,7 @@ class Report:
 
     @property
     def sound(self) -> bool:
-        """Tells whether nothing but notes was found."""
+        """Returns whether nothing but notes was found."""
         return all(finding.severity == "note" for finding in self.findings)
 
     def to_json(self) -> dict[str, Any]:

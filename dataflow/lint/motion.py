@@ -197,7 +197,7 @@ def _mistake(readings: Reading, least: float) -> str:
 
 
 def _falling(stored: F64, accelerations: F64) -> str:
-    """Says which mistake turns the mean acceleration upwards that points elsewhere now; empty where none does."""
+    """Returns which mistake turns the mean acceleration upwards that points elsewhere now; empty where none does."""
     size = float(np.linalg.norm(accelerations, axis=1).mean())
 
     def upward(quaternions: F64) -> float:

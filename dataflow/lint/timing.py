@@ -35,7 +35,7 @@ class Timing:
 
     @property
     def steady(self) -> bool:
-        """Tells whether it has a rate at all: events come when they come."""
+        """Returns whether it has a rate at all: events come when they come."""
         return self.count >= FEWEST and self.period > 0 and self.spread <= STEADY * self.period
 
     @property

@@ -28,7 +28,7 @@ KEYS = "dataflow-machines"
 GRAPH_KEY = f"{KEYS}/graph"
 """Answers tools on other machines which graph runs."""
 OVER_KEY = f"{GRAPH_KEY}/over"
-"""Tells them when a run is over: by when it was started."""
+"""Announces to them that a run is over, by its start."""
 CONNECT_WITHIN = 3000
 """Milliseconds that a tool tries to reach another machine."""
 DAYS = 3650

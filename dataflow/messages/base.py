@@ -131,7 +131,7 @@ _NO_STAMP: Any = _NotGiven("stamp", "the firing's stamp")
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(scalar, array))
 class _Declared:
-    """Tells type checkers that the fields of a class below are the keywords of its constructor."""
+    """Declares to type checkers that the fields of a class below are the keywords of its constructor."""
 
 
 class Message(_Declared):

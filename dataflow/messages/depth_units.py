@@ -55,7 +55,7 @@ class DepthSpan(NamedTuple):
         return "other" if too_near or self.median > FARTHEST else "either"
 
     def doubt(self) -> str:
-        """Says which other unit would make these the depths of a depth camera; empty where none would."""
+        """Returns which other unit would make these the depths of a depth camera; empty where none would."""
         if self.judged(MILLIMETRES / FIFTHS) == "other":
             there = self.times(MILLIMETRES / FIFTHS)
             return f"depth is {self}, most of it farther than depth cameras see; with 5000 units a metre it is {there}"

@@ -37,7 +37,7 @@ class Image(Message):
 
     @property
     def is_color(self) -> bool:
-        """Tells whether there are three channels."""
+        """Returns whether there are three channels."""
         return self.data.ndim == 3
 
     def _picture(self) -> Picture | None:

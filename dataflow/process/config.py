@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """Says where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
+    """Holds where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
     of each port, the parameters that were changed, the place (incarnation, number) of the message that each port would
     have made next, and how often it has been restarted."""
 

@@ -32,7 +32,7 @@ def head_of(path: Path) -> bytes:
 
 
 def beginning(path: Path, head: bytes) -> str:
-    """Says what a file is instead of an MCAP, by its first `HEAD_BYTES`."""
+    """Returns what a file is instead of an MCAP, by its first `HEAD_BYTES`."""
     if not head:
         return "it is empty"
     for magic, name in BAGS:

@@ -28,12 +28,12 @@ class Splitting:
 
     @property
     def splits(self) -> bool:
-        """Tells whether there may be more than one file."""
+        """Returns whether there may be more than one file."""
         return self.size is not None or self.every is not None
 
     def due(self, saved: int, elapsed: int, front: int = 0) -> bool:
-        """Tells whether a file of `saved` bytes and `elapsed` ns of event time is full, which began with `front` bytes
-        that each file begins with: below that limit, one would begin with each message."""
+        """Returns whether a file of `saved` bytes and `elapsed` ns of event time is full, which began with `front`
+        bytes that each file begins with: below that limit, one would begin with each message."""
         large = self.size is not None and saved >= max(self.size, 2 * front)
         return large or (self.every is not None and elapsed >= self.every)
 

@@ -31,7 +31,7 @@ _GENERATION, _OFFSET, _CAPACITY, _LENGTH = range(4)
 
 @dataclass(slots=True)
 class Reached:
-    """Says where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, the
+    """Holds where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, the
     parameters that were changed, and the place (incarnation, number) of the next message of each port."""
 
     incarnation: int = 0

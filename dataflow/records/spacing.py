@@ -17,7 +17,7 @@ MOST_OFTEN = 16
 
 
 class StateSpacing:
-    """Tells when an operator's state is to be recorded.
+    """Decides when an operator's state is to be recorded.
 
     `snapshots`: about every so many ns of event time, then at the same firings in every run; "cpu": whenever repeating
     its calls since the last state would take `CPU_SPACING`. `repeated`: how many operators are repeated for a call, it

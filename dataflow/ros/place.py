@@ -19,7 +19,7 @@ TYPE = r"^(|[A-Za-z]\w*/msg/[A-Za-z]\w*)$"
 
 
 class Place:
-    """Says which topic of which ROS graph is meant, and with which quality of service."""
+    """Names the topic of which ROS graph is meant, and with which quality of service."""
 
     topic: str = Param(pattern=TOPIC, doc="name of the topic; without a leading slash, it lies in the namespace")
     distro: Distro = Param("jazzy", doc="distribution whose definition of the type counts, where that is given")

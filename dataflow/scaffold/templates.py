@@ -32,8 +32,7 @@ class $Class(Operator):
     state: State
 
     def process(self, image: Image) -> Number:
-        """Called for each image, in the order of their timestamps. Returns a message, which gets the image's timestamp,
-        or None for nothing."""
+        """Returns the brightness of an image; None gives no message. The result gets the image's timestamp."""
         value = self.scale * float(image.data.mean()) / 255
         if value < self.state.darkest:
             self.state.darkest = value
@@ -41,7 +40,7 @@ class $Class(Operator):
         return Number(value=value)
 
     def summary(self) -> dict[str, float]:
-        """Figures that `dataflow run` prints at the end."""
+        """Returns the figures that `dataflow run` prints at the end."""
         return {"darkest": self.state.darkest}
 ''')
 
@@ -73,7 +72,7 @@ def test_the_scale_is_a_factor_and_above_zero() -> None:
         $Class(scale=0)
 
 
-def test_a_snapshot_is_gone_on_from() -> None:
+def test_restore_continues_from_a_snapshot() -> None:
     first, second = $Class(), $Class()
     play(first, {"image": [image(1, 51)]})
     second.restore(first.snapshot())
@@ -98,7 +97,7 @@ class $Class(Operator, every="500ms"):
     rate: Out[Number] = Out(doc="images a second")
 
     def process(self, image: tuple[Image, ...]) -> Number:
-        """Called at each tick, also when no image came. The result gets the tick's timestamp."""
+        """Returns the rate at a tick, also when no image came. The result gets the tick's timestamp."""
         return Number(value=len(image) / 0.5, unit="Hz")
 ''')
 
@@ -142,11 +141,11 @@ class Device:
         return 21.5
 
     def close(self) -> None:
-        """Lets go of the device."""
+        """Releases the device."""
 
 
 class $Class(Source):
-    """Readings of a thermometer, as they come."""
+    """Reads a thermometer."""
 
     real_time = True  # it waits for no consumer: `dataflow run --live` reads it on a separate thread
 
@@ -167,7 +166,7 @@ class $Class(Source):
             done += 1
 
     def close(self) -> None:
-        """Called at the end, also after an error."""
+        """Releases the device at the end, also after an error."""
         self.device.close()
 ''')
 

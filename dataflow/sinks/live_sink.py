@@ -14,5 +14,5 @@ class LiveSinkProcess(SinkProcess):
         let_others_begin()
 
     def _reached(self) -> dict[str, int]:
-        """Tells up to where it has taken what follows from each source: operators drop, so their streams do not say."""
+        """Returns up to where it has taken what follows from each source; streams of operators that drop do not."""
         return dict(self._taken)

@@ -52,7 +52,7 @@ class Lost:
 
 
 class Outage:
-    """Says when a recorder whose disk has refused may try again."""
+    """Decides when a recorder whose disk has refused may try again."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] | None = None) -> None:
         self._folder, self._clock = folder, clock or time.monotonic

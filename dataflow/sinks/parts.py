@@ -359,7 +359,7 @@ class PartsSink:
         return older > (0 if any(map(self._holds_any, self._open_parts())) else 1)
 
     def _holds_any(self, part: Part) -> bool:
-        """Tells whether anything is in a part but what is in front of each."""
+        """Returns whether anything is in a part but what is in front of each."""
         saved = part.sink.writer.saved
         return part.sink.saved_calls > 0 or any(saved(stream) > part.repeated[stream] for stream in self._streams)
 

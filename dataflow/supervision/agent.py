@@ -119,7 +119,7 @@ class Agent:
             undeclare(taken)
 
     def _look_at_link(self, bus: Bus) -> None:
-        """Says what stands in the way where no run comes for a while."""
+        """Prints what stands in the way where no run comes for a while."""
         connected, now = any(bus.session.info.routers_zid()), time.monotonic()
         if connected != self._connected:
             self._connected, self._since = connected, now
@@ -142,7 +142,7 @@ class Agent:
             self._offered = run
 
     def _greet(self, bus: Bus) -> None:
-        """Says that this machine is there, until it stops."""
+        """Announces this machine until it stops."""
         key = machine_key(self.name, "hello")
         with contextlib.suppress(zenoh.ZError):  # the session was closed
             while not self._stopped:
@@ -368,7 +368,7 @@ class Stay:
         self._children.send(label, kind, fields, replaces=replaces)
 
     def _tell_clock(self) -> None:
-        """Tells processes of sources whose stamps are corrected, now and then, by how much the clock here is ahead."""
+        """Sends processes of sources with corrected stamps, now and then, by how much the clock here is ahead."""
         now, best = time.monotonic(), self._pipe.clocks.best
         if self._children is not None and best is not None and now >= self._clock_due:
             self._clock_due = now + CLOCK_EVERY

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dataflow.environments import EnvError
-from dataflow.graph.model import Graph, Placement, current_placement
+from dataflow.graph.model import Graph, Placement
 from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.names import firings_key
 from dataflow.recording.parts import Storage
@@ -94,7 +94,6 @@ class RunPlan:
     storage: Storage = field(default_factory=Storage)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "placement", current_placement(self.placement))
         on_failure = self.storage.on_failure or ("go_on" if self.live else "end")
         object.__setattr__(self, "storage", replace(self.storage, on_failure=on_failure))
 

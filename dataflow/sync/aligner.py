@@ -255,7 +255,7 @@ class Aligner:
         return self.output_frontier()
 
     def ended(self) -> bool:
-        """Tells whether `poll` has returned the `finish` firing, and will return no other."""
+        """Returns whether `poll` has returned the `finish` firing, and will return no other."""
         return self._finished
 
     def final_stamp(self) -> int | None:
@@ -264,13 +264,13 @@ class Aligner:
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
-        """Tells how many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
+        """Returns how many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
         return self._drop_log.counts
 
     @property
     def late(self) -> Mapping[str, int]:
-        """Tells how many messages came after what needed them was decided, by input. Triggers among them are dropped as
-        `late`; Sampled and Batch messages still serve the firings to come."""
+        """Returns how many messages came after what needed them was decided, by input. Triggers among them are dropped
+        as `late`; Sampled and Batch messages still serve the firings to come."""
         return self._drop_log.late
 
     def take_drops(self) -> list[Drop]:
@@ -278,7 +278,7 @@ class Aligner:
         return self._drop_log.take()
 
     def take_unlisted(self) -> Mapping[tuple[str, str], int]:
-        """Tells how many drops were too many to be kept since this was last asked, by (input, reason)."""
+        """Returns how many drops were too many to be kept since this was last asked, by (input, reason)."""
         return self._drop_log.take_unlisted()
 
     def buffered(self) -> dict[str, int]:

@@ -22,7 +22,7 @@ class Batch:
         self._drop = drop
 
     def knows(self, stamp: int) -> bool:
-        """Tells whether the batch up to `stamp` is complete."""
+        """Returns whether the batch up to `stamp` is complete."""
         return all(lane.frontier >= stamp for lane in self._lanes)
 
     def needs(self, stamp: int) -> int | None:

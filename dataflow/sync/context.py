@@ -42,7 +42,7 @@ class Context:
         return iter(self._lanes)
 
     def knows(self, stamp: int) -> bool:
-        """Tells whether what belongs to `stamp` can no longer change."""
+        """Returns whether what belongs to `stamp` can no longer change."""
         for sampled in self._sampled.values():
             if not sampled.knows(stamp):
                 return False

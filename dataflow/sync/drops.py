@@ -62,7 +62,7 @@ class DropLog:
         return events
 
     def take_unlisted(self) -> dict[tuple[str, str], int]:
-        """Tells how many drops since this was last asked were too many to be kept, by (input, reason)."""
+        """Returns how many drops since this was last asked were too many to be kept, by (input, reason)."""
         unlisted = dict(self._unlisted)
         self._unlisted.clear()
         return unlisted

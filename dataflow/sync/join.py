@@ -105,7 +105,7 @@ class Join:
         return (min(heads), {self._anchor.input: min(heads) + self._tolerance}) if heads else None
 
     def _match(self, stamp: int) -> bool:
-        """Tells whether the anchor at `stamp` matches or still may; leaves what is known in `_partners`."""
+        """Returns whether the anchor at `stamp` matches or still may; leaves what is known in `_partners`."""
         self._partners = []
         for lane in self._others:
             partner = self._partner(lane, stamp)

@@ -133,7 +133,7 @@ class Lane:
 
     @property
     def reach(self) -> int:
-        """Tells how far the stream is known to go: its final stamp once it ended, else its frontier."""
+        """Returns how far the stream is known to go: its final stamp once it ended, else its frontier."""
         if not self.state.ended:
             return self.frontier
         return NEVER if self.state.final is None else self.state.final

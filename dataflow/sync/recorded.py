@@ -37,7 +37,7 @@ class Uses:
                     self._more[place] = self._more.get(place, 0) + 1
 
     def left(self, stream: str, incarnation: int, seq: int) -> bool:
-        """Tells whether a message is still to be taken."""
+        """Returns whether a message is still to be taken."""
         page = self._pages.get((stream, incarnation), {}).get(seq >> _BITS)
         return page is not None and page[seq & _PAGE - 1] > 0
 
@@ -77,7 +77,7 @@ class RecordedAligner:
             self._held[MessageRef(stream, entry.incarnation, entry.seq)] = entry
 
     def takes(self, stream: str, entry: Entry) -> bool:
-        """Tells whether a firing to come takes a message."""
+        """Returns whether a firing to come takes a message."""
         return self._uses.left(stream, entry.incarnation, entry.seq)
 
     def take(self, record: FiringInputs) -> Firing | None:

@@ -26,7 +26,7 @@ class Sampled:
         self._lanes = tuple(lanes)
 
     def knows(self, stamp: int) -> bool:
-        """Tells whether the value at `stamp` can no longer change."""
+        """Returns whether the value at `stamp` can no longer change."""
         cut = stamp - self._delay
         return all(lane.frontier >= cut for lane in self._lanes)
 

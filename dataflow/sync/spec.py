@@ -128,7 +128,7 @@ class AlignSpec:
 
     @property
     def joins(self) -> bool:
-        """Tells whether triggers have to meet: a join of two or more."""
+        """Returns whether triggers have to meet: a join of two or more."""
         return self.mode == "join" and len(self.triggers) > 1
 
     @property

@@ -65,7 +65,7 @@ class Undecided:
             self.ready = ticks.confirmed and triggers.bound >= tick
 
     def exhausted(self) -> bool:
-        """Tells whether neither trigger nor tick is left."""
+        """Returns whether neither trigger nor tick is left."""
         over = self.stamp is None and self._triggers.bound == FOREVER
         return over and (self._ticks is None or self._ticks.stamp == FOREVER)
 

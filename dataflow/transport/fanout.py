@@ -128,7 +128,7 @@ class Fanout:
         return None if pool is None else pool.room(nbytes)
 
     def quiet(self) -> bool:
-        """Tells whether no link has anything that waits for room, or a consumer that was replaced or has died."""
+        """Returns whether no link has anything that waits for room, or a consumer that was replaced or has died."""
         for link in self._links:  # noqa: SIM110 - no generator: this is asked in every turn of a process's loop
             if not link.quiet():
                 return False

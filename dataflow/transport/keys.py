@@ -22,7 +22,7 @@ def local_key(namespace: str, *chunks: str) -> str:
 
 
 def static_key(stream: str) -> str:
-    """Tells where the static stream `stream` (or those that match an expression) is answered to late joiners."""
+    """Returns where the static stream `stream` (or those that match an expression) is answered to late joiners."""
     return f"{stream}/{RUNTIME}/static"
 
 
@@ -32,12 +32,12 @@ def stream_of_static(key: str) -> str:
 
 
 def statics_key(namespace: str, bus: str) -> str:
-    """Tells where a process answers which static streams it holds; `*` for all processes."""
+    """Returns where a process answers which static streams it holds; `*` for all processes."""
     return runtime_key(namespace, "statics", bus)
 
 
 def tap_key(namespace: str, tap: str, stream: str) -> str:
-    """Tells where the copies of `stream` for one tap travel."""
+    """Returns where the copies of `stream` for one tap travel."""
     return runtime_key(namespace, "tap", tap, stream.removeprefix(f"{namespace}/"))
 
 

@@ -100,7 +100,7 @@ class Outgoing:
             self._begin_anew()
 
     def quiet(self) -> bool:
-        """Tells whether nothing waits for room, and the consumer is the one that it was at the last look."""
+        """Returns whether nothing waits for room, and the consumer is the one that it was at the last look."""
         return not (self._waiting or self.joined or self.away) and self._reader == self._words[READERS]
 
     def present(self) -> bool:
@@ -110,7 +110,7 @@ class Outgoing:
         return not self.away
 
     def may_borrow(self, size: int, free: Callable[[], int]) -> bool:
-        """Tells whether the consumer may be lent another block.
+        """Returns whether the consumer may be lent another block.
 
         Where messages may be dropped, one that has taken nothing for `STILL` seconds may hold as much of the pool as is
         free, so that one that is stopped leaves room for the others.
@@ -125,7 +125,7 @@ class Outgoing:
         return sum(held for _, _, held in self._lent) + size <= free()
 
     def _takes(self) -> bool:
-        """Tells whether the consumer has taken something of late, or all that there is."""
+        """Returns whether the consumer has taken something of late, or all that there is."""
         taken, now = self._ring.taken(), time.monotonic()
         if taken != self._taken or taken == self._ring.written:
             self._taken, self._took_at = taken, now
@@ -196,7 +196,7 @@ class Outgoing:
                 self.claim.drop(entry.block)
 
     def _new_reader(self) -> bool:
-        """Tells whether another process has taken the consumer's place since the last look."""
+        """Returns whether another process has taken the consumer's place since the last look."""
         reader = self._ring.reader()
         if reader == self._reader:
             return False

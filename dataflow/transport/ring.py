@@ -91,7 +91,7 @@ class RingWriter(_End):
 
     @property
     def written(self) -> int:
-        """Tells how many bytes have ever been written."""
+        """Returns how many bytes have ever been written."""
         return self._head
 
     def taken(self) -> int:
@@ -157,7 +157,7 @@ class RingReader(_End):
         self._words[_BLOCKED] = 0
 
     def arrived(self) -> bool:
-        """Tells whether there is something to take."""
+        """Returns whether there is something to take."""
         return bool(self._words[_HEAD] != self._tail)
 
     def take(self, limit: int) -> list[tuple[int, bytes]]:
@@ -197,5 +197,5 @@ class RingReader(_End):
         return False
 
     def awake(self) -> None:
-        """Says that the wait is over."""
+        """Ends the wait."""
         self._words[_ASLEEP] = 0

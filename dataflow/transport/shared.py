@@ -160,7 +160,7 @@ class PoolReader:
 
 
 def is_reference(payload: bytes) -> bool:
-    """Tells whether the payload is an envelope that stands for one in shared memory."""
+    """Returns whether the payload is an envelope that stands for one in shared memory."""
     return payload[5:6] == _REFERENCE and payload[:4] == MAGIC and len(payload) >= PRELUDE.size
 
 

@@ -211,7 +211,7 @@ class TapClient:
             self._arrived.notify()
 
     def _fits(self, origin: _Origin, messages: int, nbytes: int) -> bool:
-        """Tells whether a process keeps to the window: a single message may exceed it in bytes."""
+        """Returns whether a process keeps to the window: a single message may exceed it in bytes."""
         if messages - origin.acked[0] > self.window.messages:
             return False
         return nbytes - origin.acked[1] <= self.window.bytes or messages - origin.acked[0] == 1

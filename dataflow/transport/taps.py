@@ -29,7 +29,7 @@ NUMBER_BYTES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class TapWindow:
-    """Says how much may be under way from one process to a tap, unacknowledged. It bounds the tap's memory."""
+    """Limits how much may be under way from one process to a tap, unacknowledged. It bounds the tap's memory."""
 
     messages: int = 64
     bytes: int = 16 << 20

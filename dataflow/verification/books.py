@@ -141,7 +141,7 @@ class Book:
             self._last, self.finished = place, record.kind == "finish"
 
     def counts(self, record: FiringRecord) -> bool:
-        """Tells whether a record counts: one of those that are all there, or the beginning."""
+        """Returns whether a record counts: one of those that are all there, or the beginning."""
         return self._begin is None or record.index >= self._begin or record.kind == "setup"
 
     def _start_order(self) -> None:

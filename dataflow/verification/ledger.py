@@ -50,7 +50,7 @@ class Ledger:
     part: Cut | None = None
 
     def enter(self, verification: Verification) -> None:
-        """Tells a verification what its recording cannot account for."""
+        """Reports to a verification what its recording cannot account for."""
         account = self.accounts[verification.operator]
         verification.not_stored = account.not_stored
         lacking = self.torn and bool(account.not_stored or verification.beyond)

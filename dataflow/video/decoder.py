@@ -25,7 +25,7 @@ _HEADERS: dict[str, Callable[[], Headers]] = {"h264": H264Headers, "h265": H265H
 
 
 def is_key(format_: str, data: bytes) -> bool:
-    """Tells whether decoding can begin with a packet: a key frame with its parameter sets."""
+    """Returns whether decoding can begin with a packet: a key frame with its parameter sets."""
     return is_h264_key(data) if format_ == "h264" else is_h265_key(data)
 
 

@@ -18,7 +18,7 @@ _HEADER = 64
 
 
 def is_key(data: bytes) -> bool:
-    """Tells whether a packet is a key frame with its parameter sets: a file can begin with it."""
+    """Returns whether a packet is a key frame with its parameter sets: a file can begin with it."""
     kinds = {unit[0] & 31 for unit in units(data)}
     return {IDR, SPS, PPS} <= kinds
 

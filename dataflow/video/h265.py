@@ -31,7 +31,7 @@ def _base_layer(data: bytes) -> Iterator[bytes]:
 
 
 def is_key(data: bytes) -> bool:
-    """Tells whether a packet is a key frame with its parameter sets: a file can begin with it."""
+    """Returns whether a packet is a key frame with its parameter sets: a file can begin with it."""
     kinds = {_kind(unit) for unit in units(data)}
     return {VPS, SPS, PPS} <= kinds and any(kind in _KEYS for kind in kinds)
 

@@ -10,8 +10,8 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from dataflow.view.canvas import Canvas, visualizer
     from dataflow.view.drawing import visualize
-    from dataflow.view.playback import as_alarm, from_recording
     from dataflow.view.process import ViewerError
+    from dataflow.view.recordings import as_alarm, from_recording
     from dataflow.view.scene import SceneState, ViewOptions
     from dataflow.view.sink import SinkStatistics, ViewerSink
     from dataflow.view.targets import Connect, Save, Serve, Spawn, Target, parse_target
@@ -21,7 +21,7 @@ else:
         {
             "canvas": ("Canvas", "visualizer"),
             "drawing": ("visualize",),
-            "playback": ("as_alarm", "from_recording"),
+            "recordings": ("as_alarm", "from_recording"),
             "process": ("ViewerError",),
             "scene": ("SceneState", "ViewOptions"),
             "sink": ("SinkStatistics", "ViewerSink"),

@@ -93,7 +93,7 @@ class Backlog:
             return len(self._static) + len(self._messages)
 
     def _full(self, size: int) -> bool:
-        """Tells whether another message of `size` bytes is too much; one message alone never is."""
+        """Returns whether another message of `size` bytes is too much; one message alone never is."""
         return bool(self._messages) and (
             len(self._messages) >= self.bounds.messages or self._bytes + size > self.bounds.bytes
         )

@@ -84,14 +84,14 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
     """
     clouds = shown.of_type(PointCloud)
     contents = []
-    for name in _with_role(shown, "space"):
-        contents.append(f"+ {entity_of(name)}/space/**")
+    placed = [name for name in _with_role(shown, "space") if (name, "space") not in shown.empty]
+    contents += [f"+ {entity_of(name)}/space/**" for name in placed]
     for name in _with_role(shown, "image"):
         users = [c for c in shown.cameras if name in (c.image, c.info)]
         calibrated = [c for c in users if c.info is not None]
         if not users or any(not (c.depth and clouds) for c in calibrated):
             contents.append(f"+ {entity_of(name)}")
-    if not _with_role(shown, "space") and not any(c.depth and c.info is not None for c in shown.cameras):
+    if not placed and not any(c.depth and c.info is not None for c in shown.cameras):
         return None
     forever = rr.VisibleTimeRange(
         TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
@@ -187,14 +187,14 @@ def _plots(shown: Layout) -> list[Part]:
             continue
         entity, title, apart = entity_of(name), _short(name, shown), plots_of(shown.streams[name])
         if apart:
-            drawn = [what for what in apart if (name, what) not in shown.silent]
+            drawn = [what for what in apart if (name, f"plot/{what}") not in shown.empty]
             each = [_plot(f"{title} {what}", [f"+ {entity}/plot/{what}/**"]) for what in drawn]
             parts += [rrb.Vertical(contents=each, name=title)] if each else []
         else:
             parts.append(_plot(title, [f"+ {entity}/plot/**"]))
-    if health:
-        for kind, title in (("latency", "Latency"), ("rate", "Rates"), ("value", "Health")):
-            parts.append(_plot(title, [f"+ {entity_of(name)}/plot/{kind}/**" for name in health]))
+    for kind, title in (("latency", "Latency"), ("rate", "Rates"), ("value", "Health")):
+        drawn = [name for name in health if (name, f"plot/{kind}") not in shown.empty]
+        parts += [_plot(title, [f"+ {entity_of(name)}/plot/{kind}/**" for name in drawn])] if drawn else []
     return parts
 
 

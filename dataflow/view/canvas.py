@@ -36,7 +36,7 @@ class Canvas:
 
     @property
     def static(self) -> bool:
-        """Tells whether the message holds for all time."""
+        """Returns whether the message holds for all time."""
         return self.stream in self.scene.layout.static
 
     @property
@@ -56,17 +56,23 @@ class Canvas:
             frame = NAMELESS
         if frame != self.plane:
             self.scene.see(self.recording, frame, self.stamp)
+        if path.startswith("space"):
+            self.begin("space")
         self._begin(path, frame)
         self.log(path, rr.CoordinateFrame(frame), *archetypes)
 
     def _begin(self, path: str, frame: str) -> None:
-        """Says from the beginning on in which frame a path is drawn: a viewer asks also where nothing is yet."""
+        """Logs from the beginning on in which frame a path is drawn: a viewer asks also where nothing is yet."""
         begin = self.scene.begin
         if self.static or begin is None or begin >= self.stamp or not self.scene.changed(self.entity, f"/{path}", True):
             return
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(begin, "ns"))
         self.log(path, rr.CoordinateFrame(frame))
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(self.stamp, "ns"))
+
+    def begin(self, part: str) -> None:
+        """Notes that a part of the stream is drawn (`space`, `plot/NAME`), so that it gets its view."""
+        self.scene.new_parts |= self.scene.changed(self.entity, part, True)
 
     def clear(self, path: str) -> None:
         """Takes away what was drawn at `<entity>/<path>` before, and below."""
@@ -78,7 +84,7 @@ class Canvas:
         where = f"plot/{path}"
         if not len(values):
             return
-        self.scene.new_curves |= (self.entity, where) not in self.scene.remembered
+        self.scene.new_parts |= (self.entity, where) not in self.scene.remembered
         if self.scene.changed(self.entity, where, tuple(names)):
             paint = colors.AXES if len(names) == 3 else colors.of_classes(names)
             self.log(where, rr.SeriesLines(names=list(names), colors=paint), static=True)
@@ -89,12 +95,12 @@ class Canvas:
         self.log("log", rr.TextLog(text, level=level))
 
     def notice(self, text: str, level: str = "WARN") -> None:
-        """Tells people once that this stream is not shown as it is."""
+        """Logs once that this stream is not shown as it is."""
         if self.scene.once(self.stream, text):
             self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level=level))
 
     def place_frames(self, message: Message) -> None:
-        """Says where the frames lie that a message places, and draws nothing."""
+        """Places the frames of a message, and draws nothing."""
         match message:
             case Transforms():
                 for frame, child, T in zip(message.frames, message.child_frames, message.matrices(), strict=True):
@@ -103,7 +109,7 @@ class Canvas:
                 self.place(message.frame, message.child_frame, message.matrix())
 
     def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
-        """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
+        """Places `child` by `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
 
         What cannot be (a frame within itself) is not drawn, and said once.
         """

@@ -7,7 +7,7 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 import dataflow.view.visualizers  # noqa: F401  (registers the built-in ones)
-from dataflow.messages import Message
+from dataflow.messages import Message, Tracks
 from dataflow.view.canvas import PLOTS, ROLES, VISUALIZERS, Canvas, Role
 from dataflow.view.scene import TIMELINE, SceneState
 
@@ -20,6 +20,12 @@ def roles_of(message_type: type[Message]) -> tuple[Role, ...]:
 def plots_of(message_type: type[Message]) -> tuple[str, ...]:
     """Returns the plots with separate axes."""
     return next((PLOTS[c] for c in message_type.__mro__ if c in PLOTS), ())
+
+
+def parts_of(message_type: type[Message]) -> tuple[str, ...]:
+    """Returns what messages of a type may draw or not: `plot/NAME` of curves, `space` of tracks without positions."""
+    space = ("space",) if issubclass(message_type, Tracks) else ()
+    return (*space, *(f"plot/{name}" for name in plots_of(message_type)))
 
 
 def visualize(

@@ -167,7 +167,7 @@ class FrameTree:
         return {child: edge.parent for child, edge in self._edges.items() if edge.assumed}
 
     def reason(self, frame: str) -> str:
-        """Tells which streams an assumed place was worked out from; empty where it is the parent's origin."""
+        """Returns which streams an assumed place was worked out from; empty where it is the parent's origin."""
         edge = self._edges.get(frame)
         return edge.owner if edge is not None and edge.assumed else ""
 
@@ -229,7 +229,7 @@ class FrameTree:
         return [*changes, Attach(lower, upper, T, assumed=True)]
 
     def _is_blind(self, frame: str) -> bool:
-        """Tells whether `frame` hangs where it does only because it had to hang somewhere."""
+        """Returns whether `frame` hangs where it does only because it had to hang somewhere."""
         edge = self._edges.get(frame)
         return edge is not None and edge.assumed and not edge.owner
 
@@ -248,6 +248,6 @@ class FrameTree:
 
 
 def _preference(frame: str) -> int:
-    """Tells how much a frame is the one to draw everything in: 0 is best. Prefixes (`robot1/map`) do not count."""
+    """Returns how much a frame is the one to draw everything in: 0 is best. Prefixes (`robot1/map`) do not count."""
     name = frame.rsplit("/", 1)[-1]
     return ROOTS.index(name) if name in ROOTS else len(ROOTS)

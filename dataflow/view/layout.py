@@ -65,7 +65,7 @@ class Layout:
     - `aside`: truth that is drawn but switched off: scenes, surfaces, and boxes where others are estimated.
     - `kept`: clouds whose points stay where they were seen.
     - `placing`: streams that are not shown, and of which only the frames that they place are taken.
-    - `silent`: streams and the curves of theirs that have drawn nothing so far.
+    - `empty`: streams and the parts of theirs (`space`, `plot/NAME`) that have drawn nothing so far.
     - `panels`: the parts of the window that the graph asks for; none: all.
     """
 
@@ -77,7 +77,7 @@ class Layout:
     panels: tuple[str, ...] = ()
     kept: frozenset[str] = frozenset()
     placing: frozenset[str] = frozenset()
-    silent: frozenset[tuple[str, str]] = frozenset()
+    empty: frozenset[tuple[str, str]] = frozenset()
 
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
@@ -169,7 +169,7 @@ def _calibration(image: str, infos: list[str], images: list[str], graph: Graph |
 
 
 def _drawn(image: str, graph: Graph) -> bool:
-    """Tells whether an operator makes an image of messages none of which is an image."""
+    """Returns whether an operator makes an image of messages none of which is an image."""
     if image not in graph.streams:
         return False
     taken = [stream for streams in graph.producer(image)[0].inputs.values() for stream in streams]
@@ -255,7 +255,7 @@ def _common(a: str, b: str) -> list[str]:
 
 
 def _likeness(a: str, b: str) -> tuple[int, int]:
-    """Tells how much two names share: words, then leading letters."""
+    """Returns how much two names share: words, then leading letters."""
     words_a, words_b = set(_words(a)), set(_words(b))
     prefix = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
     return len(words_a & words_b), prefix

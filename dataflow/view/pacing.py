@@ -26,7 +26,7 @@ class Pace:
     _passed: dict[str, Message] = field(default_factory=dict)  # stream: its last message, where that was not drawn
 
     def takes(self, stream: str, message: Message) -> bool:
-        """Tells whether a message is drawn. One that is passed over is drawn at the end, if it is its stream's last."""
+        """Returns whether a message is drawn. One that is passed over is drawn at the end if it is its last."""
         if self.step == 0 or stream not in self.streams:
             return True
         step = message.stamp // self.step

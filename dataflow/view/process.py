@@ -42,7 +42,7 @@ def executable() -> Path:
 
 
 def display_problem() -> str | None:
-    """Tells why no window can be opened here, or None."""
+    """Returns why no window can be opened here, or None."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
     return None

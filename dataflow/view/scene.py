@@ -148,25 +148,25 @@ class SceneState:
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     begin: int | None = None
     """The stamp (ns) of the first message that was drawn."""
-    new_curves: bool = False
-    """Curves were begun since the views were last derived."""
+    new_parts: bool = False
+    """Parts of streams were first drawn since the views were last derived."""
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _waiting: dict[str, int] = field(default_factory=dict)
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
 
     def changed(self, entity: str, key: str, value: object) -> bool:
-        """Tells whether `value` differs from what was last remembered under (entity, key); remembers it."""
+        """Returns whether `value` differs from what was last remembered under (entity, key); remembers it."""
         if self.remembered.get((entity, key), self) == value:
             return False
         self.remembered[entity, key] = value
         return True
 
-    def has_plotted(self, stream: str, path: str) -> bool:
-        """Tells whether a stream has drawn curves at `plot/<path>`."""
-        return (entity_of(stream), f"plot/{path}") in self.remembered
+    def has_drawn(self, stream: str, path: str) -> bool:
+        """Returns whether a stream has drawn at `<entity>/<path>`, where that is a part of `parts_of` its type."""
+        return (entity_of(stream), path) in self.remembered
 
     def due(self, entity: str, stamp: int) -> bool:
-        """Tells whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""
+        """Returns whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""
         last = self.remembered.get((entity, "pose"))
         if last is not None and 0 <= stamp - last < self.options.pose_step:
             return False
@@ -185,7 +185,7 @@ class SceneState:
         return Rank.TRUTH if is_truth(stream) else Rank.ESTIMATE
 
     def trail_color(self, stream: str, streams: tuple[str, ...]) -> colors.RGB:
-        """Green for ground truth; else by the place of the stream among `streams`, those of its kind."""
+        """Returns green for ground truth, otherwise a palette colour by the place of the stream among `streams`."""
         if is_truth(stream):
             return colors.TRUTH
         others = [name for name in streams if not is_truth(name)]

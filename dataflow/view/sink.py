@@ -26,7 +26,7 @@ from dataflow.messages import Message
 from dataflow.view import process
 from dataflow.view.backlog import Backlog, Bounds
 from dataflow.view.blueprint import blueprint_of
-from dataflow.view.drawing import plots_of, visualize
+from dataflow.view.drawing import parts_of, visualize
 from dataflow.view.layout import layout
 from dataflow.view.pacing import Pace
 from dataflow.view.process import LOOPBACK, ViewerError
@@ -164,7 +164,7 @@ class ViewerSink:
         return SinkStatistics(*(self._counts[what] for what in ("drawn", "dropped", "failed", "passed")))
 
     def backlog(self) -> int:
-        """Tells how many messages wait to be drawn."""
+        """Returns how many messages wait to be drawn."""
         return len(self._backlog)
 
     def close(self, timeout: float = 10.0) -> bool:
@@ -245,7 +245,7 @@ class ViewerSink:
             self._counts["drawn"] += 1
         else:
             self._counts["failed"] += 1
-        new = stream not in self._seen or self._scene.new_curves
+        new = stream not in self._seen or self._scene.new_parts
         self._seen.add(stream)
         if new and self._outlook is not None:
             self._guarded("", lambda: self._lay_out(recording))
@@ -291,14 +291,14 @@ class ViewerSink:
             self._tell("", "layout", f"there is no layout {file} (`view: layout` in the graph); the views are derived")
 
     def _lay_out(self, recording: rr.RecordingStream) -> None:
-        """Views for the streams that have had a message, and for their curves: a sensor that is off leaves none."""
-        self._scene.new_curves = False
+        """Views for the streams that have had a message, and for what these drew: a sensor that is off leaves none."""
+        self._scene.new_parts = False
         if self._laid_out:
             return
         full = self._scene.layout
         shown = layout({name: type_ for name, type_ in full.streams.items() if name in self._seen}, self._graph)
-        curves = [(name, what) for name, type_ in shown.streams.items() for what in plots_of(type_)]
-        shown = replace(shown, silent=frozenset(c for c in curves if not self._scene.has_plotted(*c)))
+        parts = [(name, part) for name, type_ in shown.streams.items() for part in parts_of(type_)]
+        shown = replace(shown, empty=frozenset(each for each in parts if not self._scene.has_drawn(*each)))
         following = not isinstance(self.target, Save) or self.target.at_end
         blueprint = blueprint_of(shown, outlook=self._outlook, following=following, scores=bool(self._scores))
         recording.send_blueprint(blueprint)
@@ -321,7 +321,7 @@ class ViewerSink:
 
 
 def _options(target: Target, graph: Graph | None) -> ViewOptions:
-    """Tells what a file holds, by the graph's wish too; anything else shows all."""
+    """Returns what a file holds, by the graph's wish too; anything else shows all."""
     if not isinstance(target, Save):
         return ViewOptions()
     every = graph.view.every if graph is not None else None

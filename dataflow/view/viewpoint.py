@@ -85,7 +85,7 @@ class Viewpoint:
 
     @property
     def knows_more(self) -> bool:
-        """Tells whether the end of a run shows more than its beginning: points that stay, or a way."""
+        """Returns whether the end of a run shows more than its beginning: points that stay, or a way."""
         return bool(self._kept) or len(self._places) > 1
 
     def kept_points(self, points: npt.ArrayLike) -> None:

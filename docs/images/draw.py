@@ -214,7 +214,7 @@ def arrival() -> str:
                 drawing.box(146 + 118 * number, y + 54 + 30 * k, 104, 26, INK, fill="#eef2fb")
                 drawing.text(198 + 118 * number, y + 72 + 30 * k, words, size=12, anchor="middle")
     drawing.line(150, 400, 970, 400, arrow=True)
-    drawing.text(970, 420, "arrival, in the order of the clock on the wall", size=12, anchor="end")
+    drawing.text(970, 420, "order of arrival (wall clock)", size=12, anchor="end")
     return drawing.svg()
 
 
@@ -279,7 +279,7 @@ def processes() -> str:
         drawing.text(x + 75, 448, words, anchor="middle")
     drawing.line(60, 300, 760, 300, INK, width=5)
     drawing.text(60, 324, "rings in shared memory", size=13)
-    drawing.text(60, 342, "in order; only who stops in a live run misses any", FAINT, size=12)
+    drawing.text(60, 342, "in order; only a stalled reader of a live run loses any", FAINT, size=12)
     for x in places.values():
         drawing.line(x + 75, 260, x + 75, 298, arrow=True)
         drawing.line(x + 95, 298, x + 95, 260, arrow=True)
@@ -326,8 +326,8 @@ def machines() -> str:
     drawing.text(700, 245, "ring", size=12)
     drawing.line(380, 230, 560, 230, VIOLET, width=5)
     drawing.text(470, 216, "Zenoh, TLS", VIOLET, anchor="middle")
-    drawing.text(470, 252, "numbered frames,", FAINT, size=12, anchor="middle")
-    drawing.text(470, 268, "each stream once", FAINT, size=12, anchor="middle")
+    drawing.text(466, 252, "numbered frames,", FAINT, size=12, anchor="middle")
+    drawing.text(466, 268, "each stream once", FAINT, size=12, anchor="middle")
     return drawing.svg()
 
 

@@ -21,10 +21,10 @@ from dataflow.messages import (
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
-from operators.cloud.boards import Points, with_contents
 from operators.cloud.clustering import Shape, dbscan, kept, shape_of
 from operators.cloud.filtering import Voxels, finite
 from operators.cloud.gravity import gravity, told, unit
+from operators.cloud.shelf_boards import Points, with_contents
 from operators.status import counted_status
 
 FEATURES = "cluster shape: volume (m³), linearity, planarity, sphericity"

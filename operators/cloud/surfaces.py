@@ -98,7 +98,7 @@ def recognised(
 
 
 def _joined(parts: list[Plane]) -> Plane:
-    """Returns parts of one plane as a plane: that of the largest, with the members and areas of all."""
+    """Merges segments of one plane: the largest one's normal and offset, with the members and areas of all."""
     largest = max(parts, key=lambda plane: plane.area)
     members = np.sort(np.concatenate([plane.members for plane in parts]))
     return replace(largest, members=members, area=sum(plane.area for plane in parts))

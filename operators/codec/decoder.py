@@ -128,7 +128,7 @@ def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Tells whether a PNG, JPEG or WebP file goes on to its end mark or its declared length; bytes may follow, as
+    """Returns whether a PNG, JPEG or WebP file goes on to its end mark or its declared length; bytes may follow, as
     cameras pad their files."""
     if data.startswith(b"\x89PNG"):
         return b"IEND\xaeB`\x82" in data

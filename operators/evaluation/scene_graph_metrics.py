@@ -71,7 +71,7 @@ class SceneGraphMetrics(Operator):
         self._graphs += 1
 
     def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so does the score."""
+        """Starts the score again: the clock of an input was reset."""
         self._begin()
 
     def summary(self) -> Mapping[str, float | int | str]:

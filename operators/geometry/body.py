@@ -53,7 +53,7 @@ class BodyPart(BaseModel):
         return T
 
     def holds(self, points: Points, padding: float) -> Mask:
-        """Tells which points (N, 3) in the part's own axes lie in it, or within `padding` of its sides."""
+        """Returns which points (N, 3) in the part's own axes lie in it, or within `padding` of its sides."""
         reach = np.asarray(self.size) / 2 + padding
         inside = np.abs(points[:, 2]) <= reach[2]
         if self.shape == "box":
@@ -66,7 +66,7 @@ class BodyPart(BaseModel):
 
 
 def in_body(points: Points, parts: Sequence[tuple[BodyPart, Matrix]], padding: float) -> Mask:
-    """Tells which points (N, 3) lie in a part; with each part comes `T_points_part` (4, 4). NaN lies in none."""
+    """Returns which points (N, 3) lie in a part; with each part comes `T_points_part` (4, 4). NaN lies in none."""
     found = np.zeros(len(points), np.bool_)
     for part, T in parts:
         near = np.flatnonzero(

@@ -22,7 +22,7 @@ _MISS = 0.5  # pixels that a ray, projected again, may be off
 
 
 def is_distorted(info: CameraInfo) -> bool:
-    """Tells whether rays bend: any coefficient differs from 0, or the model is not the pinhole's."""
+    """Returns whether rays bend: any coefficient differs from 0, or the model is not the pinhole's."""
     return info.distortion_model == "equidistant" or (info.distortion is not None and bool(np.any(info.distortion)))
 
 

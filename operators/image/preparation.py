@@ -48,7 +48,7 @@ class Preparation:
         return toned(np.ascontiguousarray(pixels), self._tone)
 
     def _shown(self, raw: CameraInfo) -> NDArray[np.bool_]:
-        """Tells which pixels of the window, before it is scaled, show a part of the raw image."""
+        """Returns which pixels of the window, before it is scaled, show a part of the raw image."""
         assert self._tables is not None
         w = self._window
         columns, rows = (table[w.y : w.y + w.height, w.x : w.x + w.width] for table in self._tables)
@@ -56,7 +56,7 @@ class Preparation:
 
 
 def same_rays(raw: CameraInfo, ideal: CameraInfo) -> bool:
-    """Tells whether pixels of both see the same, so that none needs to be sampled again."""
+    """Returns whether pixels of both see the same, so that none needs to be sampled again."""
     size = (raw.width, raw.height) == (ideal.width, ideal.height)
     return size and not is_distorted(raw) and np.array_equal(raw.K, ideal.K)
 

@@ -104,6 +104,18 @@ class LabelSpace:
         """Returns which of the classes have a role, by their numbers."""
         return [k for k, label in enumerate(labels) if role in self.roles(label)]
 
+    def called(self, name: str, labels: Sequence[str]) -> list[str]:
+        """Returns which of the classes are called `name`: the class of that name, else those that share its entry."""
+        own = [label for label in labels if _key(label) == _key(name)]
+        entry = self._entries.get(_key(name))
+        return own or [label for label in labels if entry and self._entries.get(_key(label)) is entry]
+
+    def names(self, labels: Iterable[str]) -> list[str]:
+        """Returns all names that the classes have, by their entries too; in lower case with blanks, sorted."""
+        own = {_key(label) for label in labels}
+        entries = {id(self._entries[name]) for name in own if name in self._entries}
+        return sorted(own | {name for name, entry in self._entries.items() if id(entry) in entries})
+
     def unknown(self, labels: Iterable[str]) -> list[str]:
         """Returns the classes that have no entry."""
         return [label for label in labels if _key(label) not in self._entries]

@@ -33,11 +33,11 @@ from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.localization.dead_reckoning import DeadReckoning, vertical_rate
 from operators.localization.estimate import Estimate, apart, flat, planar
+from operators.localization.interpretation import MODALITIES, Surroundings, Unusable, observation
 from operators.localization.likelihood_field import LikelihoodField
 from operators.localization.map_file import read_map
-from operators.localization.monte_carlo import CloudConfig
 from operators.localization.motion import DriveNoise
-from operators.localization.reading import MODALITIES, Surroundings, Unusable, observation
+from operators.localization.particle_filter import CloudConfig
 from operators.localization.sensor_weights import CONSISTENT
 from operators.localization.weighted_cloud import WeightedCloud
 from operators.status import Row, status_of_rows

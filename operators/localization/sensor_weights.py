@@ -34,7 +34,7 @@ class _Innovations:
 
 
 class SensorWeights(Remembered):
-    """Follows the innovations of several sensors: each counts less the larger they are, but only where another agrees.
+    """Down-weights sensors whose normalised innovations are large, where another sensor is consistent.
 
     Where no sensor is consistent it is the pose that is wrong, and all count in full. Innovation-based adaptation:
     Mehra, "On the identification of variances and adaptive Kalman filtering", 1970.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dataflow.operator import Remembered
 from operators.localization.competing_hypothesis import CompetingHypothesis
 from operators.localization.estimate import Estimate
-from operators.localization.monte_carlo import DOUBTFUL, CloudConfig, MonteCarlo
 from operators.localization.observations import Observation
+from operators.localization.particle_filter import DOUBTFUL, CloudConfig, ParticleFilter
 from operators.localization.sensor_weights import SensorWeights
 
 Array = NDArray[np.float64]
@@ -27,14 +27,14 @@ class WeightedCloud(Remembered):
     sensor_weights: SensorWeights
     competing: CompetingHypothesis
     stamp: int
-    _cloud: MonteCarlo | None
+    _cloud: ParticleFilter | None
 
     def __init__(self, config: CloudConfig) -> None:
         self._config, self._cloud, self.stamp = config, None, -1
         self.sensor_weights, self.competing = SensorWeights(), CompetingHypothesis()
 
-    def new_part(self, kind: type[Any]) -> MonteCarlo:
-        return MonteCarlo(self._config, np.zeros((0, 3)))
+    def new_part(self, kind: type[Any]) -> ParticleFilter:
+        return ParticleFilter(self._config, np.zeros((0, 3)))
 
     @property
     def begun(self) -> bool:
@@ -47,7 +47,7 @@ class WeightedCloud(Remembered):
     def begin_at(self, pose: Array, sigma: tuple[float, float], rng: np.random.Generator) -> None:
         """Begins about a pose (3,); `sigma` in m and rad."""
         spread = np.array([sigma[0], sigma[0], sigma[1]])
-        self._cloud = MonteCarlo(self._config, pose + spread * rng.standard_normal((self._config.most, 3)))
+        self._cloud = ParticleFilter(self._config, pose + spread * rng.standard_normal((self._config.most, 3)))
         self.competing.settle()
 
     def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
@@ -59,7 +59,7 @@ class WeightedCloud(Remembered):
         """Takes an observation (its time in ns); one that is too weak to initialise the cloud is skipped."""
         self.stamp = stamp
         if self._cloud is None:
-            self._cloud = MonteCarlo(self._config, observation.propose(self._config.most, rng))
+            self._cloud = ParticleFilter(self._config, observation.propose(self._config.most, rng))
             return
         mean, covariance, share = self._cloud.estimate()
         trust = self.sensor_weights.counts(stamp)

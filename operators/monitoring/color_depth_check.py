@@ -43,7 +43,8 @@ class ColorDepthCheck(Operator):
     lifted from the wrong points. The check adds up images, since a single one has edges that are none of the depth's.
     Near edges and far ones show whether a camera is displaced or turned, and what would put that right, where one of
     the two fits plainly better: the summary at the end has it as a finding. With `calibrate` it gives extrinsics that
-    have half of it put right, again and again while edges do not fit; the finding is then what was changed in all.
+    have half of it put right, again and again while edges do not fit, by what fits better, however little; the finding
+    is then what was changed in all.
     Where near and far are about equally far, as in a small room, a displacement may pass for a turn: both fit there.
 
     Method: edges of depth on edges of the image, added up over images, as in Levinson and Thrun, "Automatic online
@@ -104,7 +105,7 @@ class ColorDepthCheck(Operator):
         if self.state.since < _TRUSTED or not any(shift.off(_LEAST) for shift in self.state.alignment.shifts()):
             return False
         found = self.state.alignment.correction(K)
-        if found is None or not found.sure:
+        if found is None:
             return False
         self.state.change = found.matrix(_SHARE) @ self.state.change
         self.state.alignment, self.state.since = EdgeAlignment(), 0

@@ -14,7 +14,7 @@ from operators.weights import NetworkFileError, open_network
 
 
 class ImageClassifier(Operator):
-    """Says what a whole image shows, or, with `per: object`, what each of the objects detected in it is.
+    """Classifies a whole image, or, with `per: object`, each of the objects detected in it.
 
     On one CPU thread, so equal images give equal classes. Detections count when they have the image's own stamp; an
     image without any gets no rows, and is counted.

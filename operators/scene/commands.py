@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from dataflow.api.recordings import open as open_recording
 from dataflow.messages import Activity, FeatureVector, SceneGraph
 from dataflow.messages.scene_summary import (
     agents_in_words,
@@ -21,6 +23,7 @@ from dataflow.messages.scene_summary import (
     summarize,
 )
 from dataflow.recording import Recording, RecordingError
+from operators.labels import LabelSpace, LabelSpaceError, labels_file
 from operators.scene.graph.history import Event, history
 from operators.scene.graph.meaning import by_meaning, how_to_embed
 from operators.scene.graph.query import Match, QueryError, as_json, ask
@@ -31,6 +34,9 @@ _OLD = 1.0
 
 _LIKEST = 10
 """Nodes that a question by meaning is answered with."""
+
+_PIPED = 160
+"""Columns of a table that no terminal shows."""
 
 scene = typer.Typer(name="scene", add_completion=False)
 
@@ -85,11 +91,7 @@ def show(
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
     if json:
-        content = as_json(graph, activities)
-        if matches is not None:
-            content["query"] = query
-            content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
-        typer.echo(jsonlib.dumps(content))
+        _print_json(graph, activities, query, matches)
     elif nodes:
         _show(graph, since)
     elif matches is None:
@@ -102,6 +104,14 @@ def show(
         raise typer.Exit(1)
 
 
+def _print_json(graph: SceneGraph, activities: Activity | None, query: str | None, matches: list[Match] | None) -> None:
+    content = as_json(graph, activities)
+    if matches is not None:
+        content["query"] = query
+        content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
+    typer.echo(jsonlib.dumps(content))
+
+
 def _answer(graph: SceneGraph, matches: list[Match]) -> None:
     out, names = Console(), graph.names()
     for m in matches:
@@ -112,12 +122,12 @@ def _answer(graph: SceneGraph, matches: list[Match]) -> None:
 
 def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> list[Match]:
     """Returns what fits a question, or, where that is none of classes and relations, what is like it in meaning."""
-    try:
-        return ask(graph, query)
-    except QueryError as error:
-        reason = str(error)
     with _opened(path) as recording:
         built, _ = _built(recording, stream)
+        try:
+            return ask(graph, query, _labels(path, built))
+        except QueryError as error:
+            reason = str(error)
         room = built.rpartition("/")[0].rpartition("/")[0]
         known = [n for n, info in recording.streams.items() if info.message_type is FeatureVector]
         means = [n for n in known if n.endswith("/means") and n.startswith(f"{room}/" if room else "")]
@@ -130,6 +140,20 @@ def _asked(path: Path, stream: str | None, graph: SceneGraph, query: str) -> lis
         matches = by_meaning(graph, vectors, query)[:_LIKEST]
     Console(stderr=True).print(f"note: by meaning, since {reason}", highlight=False, soft_wrap=True, markup=False)
     return matches
+
+
+def _labels(path: Path, built: str) -> LabelSpace:
+    """Returns the label space of the operator that made the graph; one without entries where its file is not here."""
+    with open_recording(path) as recording:
+        run = recording.graph
+    maker = None if run is None or built not in run.streams else run.nodes[run.streams[built].node]
+    given = "" if maker is None else str(maker.params.get("labels", ""))
+    try:
+        return LabelSpace.read(Path(labels_file(given))) if given else LabelSpace("none")
+    except (OSError, LabelSpaceError) as error:
+        note = f"note: classes have no other names here, since their label space cannot be read: {error}"
+        Console(stderr=True).print(note, highlight=False, soft_wrap=True, markup=False)
+        return LabelSpace("none")
 
 
 def _write(graph: SceneGraph, file: Path, *, overwrite: bool) -> None:
@@ -238,10 +262,12 @@ def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since
 
 def _show(graph: SceneGraph, since: float) -> None:
     out, names = Console(), graph.names()
+    out = out if out.is_terminal else Console(width=_PIPED)
     scores = graph.relation_scores
-    table = Table(title=f"{graph.count} nodes at {since:.1f} s in {graph.frame}", title_justify="left")
+    title = f"{graph.count} nodes at {since:.1f} s in {graph.frame}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in ("node", "score", "position, m", "size, m", "tracks", "relations"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column not in ("tracks", "relations"))
     for k in range(graph.count):
         held = [
             f"{p.replace('_', ' ')} {names[o]}" + ("" if scores is None else f" {scores[j]:.2f}")

@@ -189,7 +189,7 @@ class RelationScore:
         return 2 * hit / (2 * hit + false + miss) if hit + false + miss else float("nan")
 
     def precision(self, scope: str) -> float:
-        """Returns the share of the relations said that are true; NaN without any."""
+        """Returns the precision: correct of all predicted relations, NaN if none were predicted."""
         hit, false, _ = self._counted(scope)
         return hit / (hit + false) if hit + false else float("nan")
 

@@ -29,7 +29,7 @@ Pixels = NDArray[np.uint8]
 
 
 def scored(network: Network) -> bool:
-    """Tells whether a segmenter's file answers with its scores in 8 bits."""
+    """Returns whether a segmenter's file answers with its scores in 8 bits."""
     outputs = network.session.get_outputs()
     return [(each.name, each.type) for each in outputs] == [("scores", "tensor(uint8)")]
 

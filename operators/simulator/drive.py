@@ -1,4 +1,4 @@
-"""Says how the robot's body moves: along its path in the plane, and in six degrees of freedom where it is shaken.
+"""Models how the robot's body moves: along its path in the plane, and in six degrees of freedom where it is shaken.
 
 A shake is a smooth random function with analytic derivatives: the bumps of a floor, or the sway of a hand. The body's
 pose is the path's pose times the shake's, so that velocities and accelerations follow from both without differences.

@@ -30,7 +30,7 @@ class Lane:
         return float(np.min(self._off_line(points))) - self.radius
 
     def holds(self, points: Array) -> bool:
-        """Tells whether all of the points (M, 2) lie in the lane, to within a centimetre."""
+        """Returns whether all of the points (M, 2) lie in the lane, to within a centimetre."""
         return bool(np.max(self._off_line(points)) <= self.radius + _SPACING / 2)
 
     def apart(self, other: Lane) -> float:

@@ -67,7 +67,7 @@ def _to_see(world: World) -> Array:
 
 
 def _in_view(offsets: Array, heading: float, pitch: float, camera: ColorCamera) -> NDArray[np.bool_]:
-    """Tells which points (..., 3) from an eye are in the image of a camera with a heading that looks down by pitch."""
+    """Returns which points (..., 3) from an eye are in the image of a camera of a heading that looks down by pitch."""
     c, s = math.cos(heading), math.sin(heading)
     ahead, left, up = offsets @ [c, s, 0.0], offsets @ [-s, c, 0.0], offsets[..., 2]
     depth = ahead * math.cos(pitch) - up * math.sin(pitch)
@@ -78,7 +78,7 @@ def _in_view(offsets: Array, heading: float, pitch: float, camera: ColorCamera) 
 
 
 def _free(world: World, eyes: Array, offsets: Array) -> NDArray[np.bool_]:
-    """Tells which points (P, M), given from each eye (P, 3), nothing that stands still hides."""
+    """Returns which points (P, M), given from each eye (P, 3), nothing that stands still hides."""
     native = open3d()
     vertices, triangles, count = [], [], 0
     for thing in world.things:

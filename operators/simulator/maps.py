@@ -19,7 +19,7 @@ _LEAST_WALL, _LEAST_TOP = 3.0, 0.1  # m²: smaller pieces of walls (pictures) an
 
 
 def occupancy(world: World, resolution: float, band: tuple[float, float], stamp: int, frame: str) -> OccupancyGrid:
-    """Tells which cells of the floor are taken.
+    """Marks the cells of the floor that are taken.
 
     A cell is taken where the surface of something that stands still lies in it between the two heights of `band` (m),
     free where the robot can get to from its start by steps to free neighbours, and unknown elsewhere: outside, and

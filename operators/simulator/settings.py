@@ -256,13 +256,13 @@ class Sensors:
         }
 
     def cast_rays(self) -> bool:
-        """Tells whether any that is on needs the renderer."""
+        """Returns whether any that is on needs the renderer."""
         seeing = (self.color_camera, self.depth_camera, self.stereo, self.lidar, self.radar, self.landmarks)
         return any(sensor.rate for sensor in seeing) or bool(self.gnss.rate and self.gnss.sky)
 
 
 class Motion(BaseModel):
-    """Says how the robot's body is shaken on its way."""
+    """Models how the robot's body is shaken on its way."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -111,7 +111,7 @@ class MultiObjectTracker(Operator):
         return made if vectors is None or features is None else made | {"looks": _looks(features, tracks)}
 
     def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: tracks of the time before mean nothing now."""
+        """Drops all tracks: the clock of an input was reset."""
         self.state.tracker.forget()
 
     def _class_ids(self, detections: Detections2D) -> NDArray[np.int32]:

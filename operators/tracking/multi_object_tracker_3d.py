@@ -100,7 +100,7 @@ class MultiObjectTracker3D(Operator):
         }
 
     def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: tracks of the time before mean nothing now."""
+        """Drops all tracks: the clock of an input was reset."""
         self.state.tracker.forget()
 
     def _solids(self, boxes: Boxes3D, T: Any) -> tuple[Solids, int]:

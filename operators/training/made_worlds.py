@@ -26,7 +26,7 @@ def worlds(first: int, count: int) -> list[Chosen]:
 
 
 def file_of(folder: Path, world: Chosen) -> Path:
-    """Tells where a folder has a world."""
+    """Returns where a folder has a world."""
     kind, seed, people = world
     return folder / f"{kind}_{seed}_{people}.npz"
 

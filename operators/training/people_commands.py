@@ -130,6 +130,6 @@ def _followed(made: Iterator[int], total: int, quiet: bool) -> None:
 
 
 def _tell(text: str, quiet: bool) -> None:
-    """Says what is learned from, unless output is for programs."""
+    """Prints what is learned from, unless output is for programs."""
     if not quiet:
         err_console.print(text, highlight=False, markup=False, soft_wrap=True)

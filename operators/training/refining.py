@@ -52,7 +52,7 @@ class Second(ABC):
         """Prepares the training for the first network in a file."""
 
     def suits(self, data: Any) -> bool:
-        """Tells whether a first network that is trained on these data can have such a second one."""
+        """Returns whether a first network that is trained on these data can have such a second one."""
         return True
 
 

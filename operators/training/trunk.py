@@ -89,11 +89,11 @@ class _Graph:
                 self.alike[known[name]] = name
 
     def computes(self, alike: Iterable[str]) -> bool:
-        """Tells whether the common part has a layer with weights: an image is brought to 8 bits in any network."""
+        """Returns whether the common part has a layer with weights: an image is brought to 8 bits in any network."""
         return any(self._made[self.alike[each]].op_type == "Conv" for each in alike)
 
     def ends(self, value: str, alike: Iterable[str]) -> bool:
-        """Tells whether a value in 8 bits, of the common part, is used beyond it."""
+        """Returns whether a value in 8 bits, of the common part, is used beyond it."""
         name = self.alike[value]
         if self._made[name].op_type != "QuantizeLinear":
             return False

@@ -38,7 +38,7 @@ class NetworkFileError(ModelError):
 
 
 def shipped(name: str) -> Path:
-    """Tells where the project's own network `name` lies."""
+    """Returns where the project's own network `name` lies."""
     return _FOLDER / name
 
 

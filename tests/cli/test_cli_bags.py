@@ -72,15 +72,6 @@ def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_
     assert "test/left/slow" not in told
 
 
-def test_the_former_name_of_the_choice_of_streams_works_and_says_so(dataflow, recorded, tmp_path: Path) -> None:
-    from dataflow.cli.support import plugins
-
-    plugins.renamed.cache_clear()
-    told = dataflow("filter", recorded[0], "--streams", "left/*", "-o", tmp_path / "part.mcap").stderr
-
-    assert "--streams is now --stream" in told
-
-
 @pytest.mark.parametrize("to", ["csv", "tum", "ros2"])
 def test_a_conversion_that_fails_or_is_interrupted_leaves_nothing(
     dataflow, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str

@@ -210,7 +210,7 @@ def test_verify_prints_the_command_that_goes_to_the_difference(
     changed = tmp_path / "changed.yaml"
     changed.write_text(small.read_text().replace("runtime_operators:Smooth", "verified_operators:Nudged"))
 
-    told = dataflow("verify", recorded[0], "--graph", changed, "--one-process", "-q", code=1).stdout
+    told = dataflow("verify", recorded[0], "--graph", changed, "--jobs", "1", "-q", code=1).stdout
     words = shlex.split(told.rpartition("next: dataflow ")[2])
     shown = dataflow(*words).stdout
 

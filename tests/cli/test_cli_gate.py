@@ -50,7 +50,7 @@ def folder(dataflow, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def gate(dataflow, folder: Path, *words: object, code: int):
-    return dataflow("verify", folder / "recordings", "--one-process", "-q", *words, code=code)
+    return dataflow("verify", folder / "recordings", "--jobs", "1", "-q", *words, code=code)
 
 
 def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -> None:
@@ -61,11 +61,10 @@ def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -
         assert any(line.split()[:2] == [name, "identical"] for line in told.splitlines())
 
 
-def test_both_times_are_told_and_options_that_are_gone_are_noted(dataflow, folder: Path) -> None:
-    outcome = dataflow("verify", folder / "recordings" / "first.mcap", "--process-each", "-q")
+def test_both_times_are_printed(dataflow, folder: Path) -> None:
+    outcome = dataflow("verify", folder / "recordings" / "first.mcap", "-q")
 
     assert re.search(r"× real time \([\d.]+ s in all\)", " ".join(outcome.stdout.split()))
-    assert "--process-each is deprecated" in outcome.stderr
 
 
 @pytest.mark.long
@@ -202,21 +201,21 @@ def test_a_tolerance_passes_with_its_own_word_and_not_as_identical(dataflow, fol
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
     one = folder / "recordings" / "first.mcap"
 
-    told = dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-process", "-q")
+    told = dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--jobs", "1", "-q")
 
     assert "within tolerance of 1e-05, not identical" in told.stdout
     assert not any(line.startswith("identical") for line in told.stdout.splitlines())
     value = json.loads(
-        dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-process", "-q", "--json").stdout
+        dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--jobs", "1", "-q", "--json").stdout
     )
     assert (value["identical"], value["within_tolerance"], value["verdict"]) == (False, True, "within tolerance")
-    dataflow("verify", one, "--graph", changed, "--tolerance", "1e-9", "--one-process", "-q", code=1)
+    dataflow("verify", one, "--graph", changed, "--tolerance", "1e-9", "--jobs", "1", "-q", code=1)
 
 
 def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder: Path, tmp_path: Path) -> None:
     broken = graph_of(tmp_path, "broken.yaml", '{use: "verified_operators:Unable", inputs: {x: left/fast}}')
 
-    words = ["verify", folder / "recordings" / "first.mcap", "--graph", broken, "--one-process", "-q"]
+    words = ["verify", folder / "recordings" / "first.mcap", "--graph", broken, "--jobs", "1", "-q"]
     told = CliRunner().invoke(app, [str(word) for word in words])
 
     assert told.exit_code == 2
@@ -259,8 +258,6 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
         (["--jobs", "0"], "--jobs 0: expected 1 to"),
-        (["--jobs", "2"], "--jobs 2: expected 1 to 1024, without --one-process"),
-        (["--process-each"], "--one-process and --process-each exclude each other"),
         (["--start", "1", "--baseline", "b.json"], "--start and --baseline exclude each other"),
         (["--start", "nan"], "--start nan: expected seconds"),
         (["--start", "inf"], "--start inf: expected seconds"),
@@ -283,7 +280,7 @@ def test_a_thin_recording_is_completed_and_is_then_verified(dataflow, folder: Pa
     told = dataflow("replay", thin, "--complete", full, "-q").stdout
 
     assert "computed again: test/one/mean, test/two/y" in told
-    assert "identical" in dataflow("verify", full, "--one-process", "-q").stdout
+    assert "identical" in dataflow("verify", full, "--jobs", "1", "-q").stdout
     assert "the same" in dataflow("diff", folder / "recordings" / "first.mcap", full).stdout
     assert "replace it with --overwrite" in dataflow("replay", thin, "--complete", full, code=2).stderr
     assert json.loads(dataflow("replay", thin, "--complete", full, "--overwrite", "--json", "-q").stdout)["whole"]

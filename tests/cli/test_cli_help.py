@@ -14,7 +14,7 @@ from typer.main import get_command
 from dataflow.cli.app import call
 from dataflow.cli.main import app
 from dataflow.cli.registry import BUILT_IN, Command, Commands, Family
-from dataflow.cli.support import arguments, plugins
+from dataflow.cli.support import arguments
 from dataflow.sync.stamps import parse_duration
 
 COMMANDS = sorted(each.called for each in BUILT_IN if isinstance(each, Command))
@@ -118,18 +118,6 @@ def test_the_help_of_the_program_offers_no_completion(dataflow) -> None:
     told = dataflow("--help").stdout
     assert "--help" in told
     assert not [word for word in ("bool", "--install-completion", "--show-completion") if word in told]
-
-
-def test_options_by_their_former_names_work_and_say_so(dataflow, small: Path) -> None:
-    plugins.renamed.cache_clear()
-    told = dataflow("run", small, "--one-host", "--patience", 60, "--set", "count=3", "-q")
-    assert "--one-host is now --one-process" in told.stderr
-    assert "--patience is now --timeout" in told.stderr
-
-    told = dataflow("verify", small, "--one-host", "--host-each", code=2)
-    assert "--one-process and --process-each exclude each other" in told.stderr
-    shown = dataflow("run", "--help").stdout
-    assert not any(name in shown for name in ("--one-host", "--host-each", "--patience"))
 
 
 def test_times_in_the_help_are_times_to_the_commands() -> None:

@@ -51,13 +51,6 @@ def test_show_draws_the_graph_as_tree_mermaid_and_json(dataflow, small: Path) ->
     assert "exclude each other" in dataflow("show", small, "--json", "--mermaid", code=2).stderr
 
 
-def test_show_says_what_takes_the_place_of_its_pictures(dataflow, small: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "small.svg"
-
-    assert "--mermaid prints a flowchart" in dataflow("show", small, "--svg", picture, code=2).stderr
-    assert not picture.exists()
-
-
 def test_operators_are_listed_and_described(dataflow) -> None:
     assert "operators.cloud:CloudBuilder" in dataflow("operators").stdout.splitlines()
     assert "stride" in dataflow("operators", "CloudBuilder").stdout

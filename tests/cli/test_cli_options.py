@@ -31,9 +31,9 @@ TRIED: tuple[str, ...] = (
     "replay RECORDING --place left=a --verbose --view OUT.rrd --open --overwrite",
     "replay RECORDING --one-process --network --loop 2",
     "replay RECORDING --complete OUT.mcap",
-    "verify RECORDING --one-process --only sum --start 0 --paranoid --path HERE --junit OUT.xml --tolerance 1e-6"
+    "verify RECORDING --jobs 1 --only sum --start 0 --paranoid --path HERE --junit OUT.xml --tolerance 1e-6"
     " --quiet --json",
-    "verify RECORDING --graph GRAPH --set count=30 --process-each --jobs 2",
+    "verify RECORDING --graph GRAPH --set count=30 --jobs 2",
     "verify RECORDING --baseline OUT.json --accept --repeat 1 --make-effects",
     "debug RECORDING smooth --graph GRAPH --set count=30 --path HERE --do next --do inputs --json --make-effects",
     "debug RECORDING smooth --do next --view OUT.rrd",

@@ -94,7 +94,7 @@ def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
 def test_verification_of_a_recording_says_identical(dataflow, recorded) -> None:
     path, _ = recorded
 
-    told = dataflow("verify", path, "--one-process", "--json", "-q")
+    told = dataflow("verify", path, "--jobs", "1", "--json", "-q")
 
     assert json.loads(told.stdout)["identical"] is True
     assert "exclude each other" in dataflow("verify", path, "--from", "smooth", "--only", "sum", code=2).stderr

@@ -18,7 +18,7 @@ SHOWN_BY = {
     "a process crashes": """
         a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on
         a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost
-        a_death_that_is_heard_of_late_is_not_taken_for_that_of_the_successor
+        a_late_death_notice_does_not_affect_the_successor
     """,
     "the same operator fails again and again": "restarts_come_to_an_end_and_the_last_cause_is_named",
     "a process fails in `setup()`, or dies while it starts": """

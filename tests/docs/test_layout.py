@@ -17,18 +17,16 @@ MOST_IN_A_FOLDER = 25
 MOST_ARROWS_IN_ODOMETRY = 40
 MOST_LINES = 60
 LONG = {
-    "dataflow.cli.commands.convert:convert": 111,
-    "dataflow.cli.commands.demo:demo": 65,
-    "dataflow.cli.commands.following.live:hz": 63,
-    "dataflow.cli.commands.following.logs:logs": 69,
-    "dataflow.cli.commands.following.recording:record": 70,
-    "dataflow.cli.commands.replay:replay": 142,
-    "dataflow.cli.commands.run:run": 106,
-    "dataflow.cli.commands.verification:verify": 132,
-    "operators.scene.commands:show": 64,
+    "dataflow.cli.commands.convert:convert": 92,
+    "dataflow.cli.commands.replay:replay": 135,
+    "dataflow.cli.commands.run:run": 103,
+    "dataflow.cli.commands.verification:verify": 86,
     "operators.scene.map.cuboid:fit_cuboid": 81,
 }
-"""Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller."""
+"""Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller.
+
+Of the commands, options and help make the lines: their bodies have at most 53.
+"""
 
 
 def allowed(repository: Path) -> dict[str, tuple[str, ...]]:

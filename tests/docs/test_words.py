@@ -24,7 +24,7 @@ def test_nothing_is_found() -> None:
     [
         ("a.md", "Nobody waits.\n```\nnobody\n```\nIt `says` so.\n", 1),
         ("a.md", "A queue of its own. What is late is dropped.\n", 2),
-        ("a.py", '"""Tells it."""\nx = "it knows nobody"  # somebody\nsays = 1\n', 3),
+        ("a.py", '"""Tells it."""\nx = "it knows nobody"  # somebody\nsays = 1\n', 4),
     ],
 )
 def test_wording_is_found_in_prose_alone(tmp_path: Path, name: str, text: str, number: int) -> None:

@@ -10,7 +10,11 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+import dataflow
+from dataflow.cli.main import app
+from dataflow.cli.support import plugins
 from dataflow.graph import GraphError, load_text
 from dataflow.messages import Number, Odometry, Point
 from dataflow.testing import play
@@ -42,7 +46,7 @@ def my_robot(blocks: Blocks) -> Iterator[ModuleType]:
 
 def test_its_tests_pass(my_robot: ModuleType) -> None:
     tests = [value for name, value in vars(my_robot).items() if name.startswith("test_")]
-    assert len(tests) == 2
+    assert len(tests) == 3
     for test in tests:
         test()
 
@@ -65,6 +69,29 @@ def test_its_operator_works_in_that_chain(my_robot: Any) -> None:
         assert isinstance(point, Point)
         assert point.frame == cloud["cloud"][0].frame  # type: ignore[attr-defined]
         assert 0.3 < float((point.position**2).sum() ** 0.5) < 2.5  # the table stands within reach of the whole path
+
+
+def test_its_command_reads_a_recording_of_its_graph(
+    my_robot: ModuleType, blocks: Blocks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (command,) = (code for code in blocks["python"] if "my_commands.py" in code)
+    entries = blocks["toml"][-1].replace("[project.entry-points.", "[").replace('"', "")
+    info = tmp_path / "my_robot-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_robot\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(entries)
+    (tmp_path / "my_commands.py").write_text(command)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "my_commands", raising=False)
+    plugins.advertised.cache_clear()
+    dataflow.run(load_text(blocks["yaml"][0].replace("frames: 30", "frames: 3")), record=tmp_path / "run.mcap")
+
+    told = CliRunner().invoke(app, ["nearest", str(tmp_path / "run.mcap"), "--below", "5"])
+    plugins.advertised.cache_clear()
+
+    assert told.exit_code == 0, told.output
+    assert re.findall(r"^0\.\d{3} s  [\d.]+ m$", told.stdout, re.MULTILINE) == told.stdout.splitlines()
+    assert len(told.stdout.splitlines()) == 3
 
 
 def test_its_first_step_needs_neither_stamp_nor_state(blocks: Blocks) -> None:

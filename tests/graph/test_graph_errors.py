@@ -614,3 +614,16 @@ def test_problems_are_json() -> None:
         "hint": "",
         "related": [{"file": "graph.yaml", "line": 3, "column": 3, "message": "first given here"}],
     }
+
+
+def test_faults_that_one_extra_mends_are_counted_behind_the_first() -> None:
+    hint = "it comes with: pip install 'robot-dataflow[perception]'"
+    missing = [Problem("graph.yaml", line, 10, f"module 'm{line}' needs 'cv2'", hint) for line in (3, 4, 5)]
+    other = Problem("graph.yaml", 6, 1, "unknown key")
+    assert str(GraphError([*missing, other])).splitlines() == [
+        "graph.yaml:3:10: module 'm3' needs 'cv2'",
+        f"      {hint}",
+        "graph.yaml:6:1: unknown key",
+        f"      and 2 more: {hint}",
+    ]
+    assert len(GraphError(missing).problems) == 3

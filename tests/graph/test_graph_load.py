@@ -115,13 +115,6 @@ def test_processes_follow_process_labels_unless_overridden() -> None:
         graph.processes({"camra": "x"})
 
 
-@pytest.mark.parametrize(("former", "now"), [("one_host", "one_process"), ("host_each", "process_each")])
-def test_former_names_of_placements_still_work_and_say_so(former: str, now: str) -> None:
-    graph = load_text(RGBD)
-    with pytest.warns(DeprecationWarning, match=f"{former!r} is now {now!r}"):
-        assert graph.processes(former) == graph.processes(now)
-
-
 @pytest.mark.parametrize(
     ("written", "matched"),
     [

@@ -38,13 +38,6 @@ class Good(Operator, merge=True, every="100ms"):
 """
 
 
-def test_names_of_the_past_are_refused_with_those_of_today() -> None:
-    with pytest.raises(TypeError, match="tunable=True"):
-        exec("class X(Operator):\n    gain: float = Param(0.5, doc='gain', live=True)", dict(NAMES))
-    with pytest.raises(OperatorDefinitionError, match=r"X\.live was renamed: .* is real_time"):
-        exec("class X(Source):\n    live = True\n    image: Out[Image]", dict(NAMES))
-
-
 def test_port_types_of_a_source_may_be_names_of_the_function_that_makes_it() -> None:
     names = dict(NAMES)
     exec("def make():\n    Local = Image\n    class X(Source):\n        image: 'Out[Local]'\n    return X", names)

@@ -61,7 +61,7 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
     assert len(corrected) == len(mounted) == 1
     joints, postures = (recorded[f"robot1/perception/{each}"] for each in ("keypoints/keypoints", "skeletons/postures"))
     assert len(joints) == len(postures) > 5
-    assert json.loads(run("verify", file, "--one-process", "--json", "-q"))["identical"] is True
+    assert json.loads(run("verify", file, "--jobs", "1", "--json", "-q"))["identical"] is True
     shown = json.loads(CliRunner().invoke(scene, [str(file), "--json"]).stdout)
     assert {n["name"] for n in shown["nodes"]} >= {"room", "self", "floor"}
     assert any(n["class"] == "bin" for n in shown["nodes"])
@@ -104,6 +104,18 @@ def test_boxes_of_any_detector_reach_the_map_and_the_tracks_unchanged(name: str)
     (detector,) = (f"robot1/{each}/detections" for each in nodes if each == "perception/detector")
     for consumer in ("lifter", "tracker"):
         assert nodes[f"perception/{consumer}"].inputs["detections"] == (detector,)
+
+
+@pytest.mark.parametrize(
+    ("name", "word"), [("perception", "perception."), ("perception_rgbd", ""), ("perception_kitti", "")]
+)
+def test_boxes_with_masks_reach_the_map_and_the_tracks_where_they_are_asked_for(name: str, word: str) -> None:
+    words = [f"{word}masks=true", f"{word}masker=own.onnx"]
+    nodes = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=words).nodes
+    assert nodes["perception/masks"].params["model"] == "own.onnx"
+    assert nodes["perception/masks"].inputs["detections"] == ("robot1/perception/detector/detections",)
+    for consumer in ("lifter", "tracker"):
+        assert nodes[f"perception/{consumer}"].inputs["detections"] == ("robot1/perception/masks/masked",)
 
 
 @pytest.mark.parametrize("name", ["perception", "perception_given", "perception_rgbd", "perception_kitti"])

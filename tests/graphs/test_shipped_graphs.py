@@ -73,7 +73,7 @@ def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies
     assert scores["detection_score"]["ap50"] > 0.5
     assert scores["segmentation_score"]["miou"] > 0.4
     assert report["streams"]["robot1/cloud/cloud"]["messages"] == 16
-    assert json.loads(dataflow("verify", file, "--one-process", "--json", "-q"))["identical"] is True
+    assert json.loads(dataflow("verify", file, "--jobs", "1", "--json", "-q"))["identical"] is True
 
 
 @pytest.mark.long

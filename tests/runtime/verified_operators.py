@@ -44,15 +44,6 @@ class Moody(Smooth):
         return made.replace(vectors=made.vectors + int.from_bytes(os.urandom(2)))
 
 
-class Dying(Smooth):
-    """Takes its process with it when it is run again alone, and only then."""
-
-    def setup(self) -> None:
-        super().setup()
-        if "DATAFLOW_TEST_DIE" in os.environ:
-            os._exit(7)
-
-
 class Unable(Smooth):
     """Cannot be set up."""
 

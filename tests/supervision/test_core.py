@@ -55,13 +55,6 @@ def test_a_time_in_which_the_supervisor_did_not_run_is_noted_and_recorded() -> N
     assert told[1]["name"] == "paused"
 
 
-def test_placements_go_by_their_former_names_for_one_version() -> None:
-    with pytest.warns(DeprecationWarning, match="'one_host' is now 'one_process'"):
-        play = Play(placement="one_host")
-
-    assert list(play.processes) == ["all"]
-
-
 def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
     play = Play(start_timeout=10.0)
     play.deaf.add("sum")

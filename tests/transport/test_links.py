@@ -85,7 +85,7 @@ def test_what_was_meant_for_a_consumer_that_died_does_not_reach_its_successor(pa
     assert pair.taken() == [("a", b"to the successor")]
 
 
-def test_a_death_that_is_heard_of_late_is_not_taken_for_that_of_the_successor(pair: Pair) -> None:
+def test_a_late_death_notice_does_not_affect_the_successor(pair: Pair) -> None:
     pair.consumer = pair.reader()
     pair.send(b"to the successor")
     pair.producer.take_leave(1)

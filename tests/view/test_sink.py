@@ -24,6 +24,7 @@ from dataflow.messages import (
     Message,
     Pose,
     SceneGraph,
+    Tracks,
     Transforms,
     array,
 )
@@ -260,6 +261,35 @@ def test_curves_get_their_view_when_they_are_first_drawn(late: bool, tmp_path: P
     named = {row.values[0] for row in blueprint_rows(path) if row.component == "ViewBlueprint:display_name"}
     assert "imu/data gyroscope" in named
     assert ("imu/data orientation" in named) == late
+
+
+@pytest.mark.parametrize("placed", [False, True])
+def test_tracks_without_places_and_a_status_without_figures_get_no_view(placed: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    tracks = Tracks(
+        stamp=STAMP,
+        frame="c",
+        boxes=[[0, 0, 2, 2]],
+        ids=[1],
+        states=[1],
+        scores=[1],
+        class_ids=[0],
+        ages=[3],
+        unseen=[0],
+    )
+    status = Diagnostics(stamp=STAMP, names=["n"], levels=[0], messages=["ok"])
+    if placed:
+        tracks = tracks.replace(positions=[[1, 0, 0]])
+        status = status.replace(keys=("rate",), values=("10 Hz",), owners=[0])
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"r/c/image": Image, "r/t/tracks": Tracks, "r/t/status": Diagnostics})
+        sink.log("r/c/image", Image(stamp=STAMP, frame="c", data=np.zeros((4, 4, 3), np.uint8)), wait=10.0)
+        sink.log("r/t/tracks", tracks, wait=10.0)
+        sink.log("r/t/status", status, wait=10.0)
+    named = {row.values[0] for row in blueprint_rows(path) if row.component == "ViewBlueprint:display_name"}
+    assert {"c/image", "Status"} <= named
+    assert ("World" in named, "Rates" in named) == (placed, placed)
+    assert not {"Latency", "Health"} & named
 
 
 def test_hidden_and_unknown_streams_are_passed_over(tmp_path: Path) -> None:

@@ -151,13 +151,7 @@ def convert(
     """
     with friendly_errors():
         existing_recording(recording)
-        output = named_once("OUTPUT", output, out_option)
-        if output is None:
-            raise fail("no output given: name a file or folder behind the recording, or with --out")
-        if to is None:
-            if output.suffix != ".rrd":
-                raise fail(f"the format of {output} is not known: give one with --to: {', '.join(get_args(Format))}")
-            to = "rrd"
+        output, to = _target(named_once("OUTPUT", output, out_option), to)
         _check_output(output, to, overwrite)
         scales = _depth_scales(depth or (), to)
         if to == "rrd":
@@ -176,11 +170,22 @@ def convert(
             done = _export(material, place, to, watch, action, task, lossy=lossy)
         done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
         shown([*material.account.notes, *material.account.short])
-    account = material.account
     if json:
-        print_json(done.as_json() | {"source": account.as_json()})
-        _fail_if_short(account)
-        return
+        print_json(done.as_json() | {"source": material.account.as_json()})
+    else:
+        _report(done, material.account, output)
+    _fail_if_short(material.account)
+
+
+def _target(output: Path | None, to: Format | None) -> tuple[Path, Format]:
+    if output is None:
+        raise fail("no output given: name a file or folder behind the recording, or with --out")
+    if to is None and output.suffix != ".rrd":
+        raise fail(f"the format of {output} is not known: give one with --to: {', '.join(get_args(Format))}")
+    return output, to or "rrd"
+
+
+def _report(done: Exported, account: Account, output: Path) -> None:
     made = table("stream", "messages", right=("messages",))
     for name, number in done.written.items():
         made.add_row(Text(name), count(number))
@@ -193,7 +198,6 @@ def convert(
     files = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
     for file in files:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
-    _fail_if_short(account)
 
 
 def _draw(

@@ -82,8 +82,11 @@ def demo(
             json=json,
             quiet=quiet,
         )
-    if json:
-        return
+    if not json:
+        _print_next(recording, outputs)
+
+
+def _print_next(recording: Path, outputs: Outputs) -> None:
     if outputs.view_file is not None:
         out.print(Text(f"look at it where there is a display: rerun {outputs.view_file}"), soft_wrap=True)
     again = f"dataflow replay {recording} --graph {GRAPH} --record demo.mcap"
@@ -92,7 +95,7 @@ def demo(
 
 
 def _announced(recording: Path, graph: Graph, duration: float, *, in_real_time: bool) -> tuple[int, int] | None:
-    """Says how long it takes; returns the first and the last stamp (ns) that are played."""
+    """Prints how long it takes; returns the first and the last stamp (ns) that are played."""
     from dataflow.recording import Recording
     from dataflow.supervision.replay import plan_replay
 

@@ -196,7 +196,7 @@ def _bar(steering: Steering) -> ReplayBar | None:
 
 @contextmanager
 def _told(server: FoxgloveServer, bar: ReplayBar) -> Iterator[None]:
-    """Tells the clients meanwhile where the replay stands, about twice a second."""
+    """Sends the clients meanwhile where the replay stands, about twice a second."""
     over = threading.Event()
 
     def tell() -> None:

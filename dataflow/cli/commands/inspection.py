@@ -71,7 +71,6 @@ def show(
     settings: Settings = None,
     path: ModuleFolders = None,
     mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
-    svg: Annotated[str | None, typer.Option("--svg", hidden=True)] = None,
     json: Json = False,
 ) -> None:
     """Show a graph: processes, operators, what each takes and makes.
@@ -85,8 +84,6 @@ def show(
     from dataflow.graph import draw, load_graph
 
     with friendly_errors():
-        if svg is not None:
-            raise fail("--svg is gone: --mermaid prints a flowchart, which GitHub, editors and mermaid.live draw")
         if json and mermaid:
             raise fail("--json and --mermaid exclude each other")
         find_modules_in(path)

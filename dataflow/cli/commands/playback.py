@@ -76,7 +76,7 @@ def keys(
 
 
 def _in_foreground(terminal: int) -> bool:
-    """Tells whether keys come here: a job in the background (`&`) would be stopped if it asked for them."""
+    """Returns whether keys come here: a job in the background (`&`) would be stopped if it asked for them."""
     try:
         return os.tcgetpgrp(terminal) == os.getpgrp()
     except OSError:  # the terminal of another session
@@ -205,7 +205,7 @@ def _wanted(action: str, value: str | None) -> tuple[int, float | None]:
 
 
 def same_digests(passes: list[dict[str, Any]]) -> bool:
-    """Tells whether all passes of a loop made the same streams."""
+    """Returns whether all passes of a loop made the same streams."""
     return all(one == passes[0] for one in passes)
 
 

@@ -172,10 +172,7 @@ def replay(
 
             given = _graph_of_bag(recording, given, completed=complete is not None)
             outputs, options = planned(given)
-            if storage.splitting.splits:
-                raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
-            if loop != 1:
-                raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
+            _check_bag(loop, splits=storage.splitting.splits)
             words = (recording, given, maps or (), clock, start, end, outputs, options)
             replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
             return
@@ -183,11 +180,7 @@ def replay(
             loaded = _recorded_graph(opened, network=network) if given is None else given
             if complete is not None:
                 others = (start, end, rate, record, view, place)
-                if others != (None,) * 6 or any((open_view, one_process, process_each, paranoid)):
-                    raise fail(
-                        "--complete repeats a run as it was, in one process: of the other options only --graph, "
-                        "--set, --overwrite, --quiet and --json go with it"
-                    )
+                _check_complete(others != (None,) * 6 or any((open_view, one_process, process_each, paranoid)))
                 _complete(recording, loaded, complete, overwrite=overwrite, json=json, quiet=quiet)
                 return
             shown = _shown(opened, loaded, start, end)
@@ -207,6 +200,21 @@ def _check_loop(loop: int, *, written: bool) -> None:
         raise fail(f"--loop {loop}: expected 1 or more, or 0 for no end")
     if loop != 1 and written:
         raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
+
+
+def _check_bag(loop: int, *, splits: bool) -> None:
+    if splits:
+        raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
+    if loop != 1:
+        raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
+
+
+def _check_complete(others: bool) -> None:
+    if others:
+        raise fail(
+            "--complete repeats a run as it was, in one process: of the other options only --graph, "
+            "--set, --overwrite, --quiet and --json go with it"
+        )
 
 
 def _graph_of_bag(bag: Path, graph: Graph | None, *, completed: bool) -> Graph:

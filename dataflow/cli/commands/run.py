@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -44,6 +44,9 @@ from dataflow.cli.support.run_options import (
     machines_of,
 )
 from dataflow.cli.support.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
@@ -133,13 +136,10 @@ def run(
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options |= {"live": live, "paused": step, "controls": keys(quiet or json, live=live, flight=flight)}
         options |= machines_of(loaded, listen, keys_folder, here=here)
-        if compression is not None:
-            if record is None and not flight:
-                raise fail("--compression is of a recording: name one with --record")
-            options["compression"] = compression
-        if flight and loaded.record.flight is not None:
-            options["flight"] = Path(loaded.record.flight.folder)
-            options["flight"].mkdir(parents=True, exist_ok=True)
+        if compression is not None and record is None and not flight:
+            raise fail("--compression is of a recording: name one with --record")
+        options |= {} if compression is None else {"compression": compression}
+        options |= _flight_folder(loaded) if flight else {}
         if chaos is not None:
             from dataflow.chaos.plan import load_plan
 
@@ -154,3 +154,10 @@ def run(
             quiet=quiet,
             verbose=verbose,
         )
+
+
+def _flight_folder(graph: Graph) -> dict[str, Path]:
+    assert graph.record.flight is not None
+    folder = Path(graph.record.flight.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return {"flight": folder}

@@ -49,6 +49,9 @@ _GATE = "Regression gate"
 MOST_JOBS = 1024
 MOST_RUNS = 100_000
 
+_From = Annotated[
+    str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
+]
 _Only = Annotated[
     list[str] | None,
     typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
@@ -61,6 +64,40 @@ _Tolerance = Annotated[
         help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
         "inputs. Reported as within tolerance, never as identical.",
     ),
+]
+_Start = Annotated[
+    float | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        parser=offset,
+        help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
+        "holds there.",
+    ),
+]
+_Baseline = Annotated[
+    Path | None,
+    typer.Option(
+        "--baseline",
+        metavar="FILE.json",
+        rich_help_panel=_GATE,
+        help="Outcomes that are accepted although they are not what was recorded.",
+    ),
+]
+_Accept = Annotated[
+    bool,
+    typer.Option(
+        "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
+    ),
+]
+_Junit = Annotated[
+    Path | None,
+    typer.Option(
+        "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
+    ),
+]
+_Why = Annotated[
+    bool, typer.Option("--why", metavar=FLAG, help="Find the causes: run each culprit alone, 8 times at most.")
 ]
 _Jobs = Annotated[
     int | None,
@@ -80,57 +117,19 @@ def verify(
     graph: OtherGraph = None,
     settings: OtherSettings = None,
     path: ModuleFolders = None,
-    first: Annotated[
-        str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
-    ] = None,
+    first: _From = None,
     only: _Only = None,
     tolerance: _Tolerance = None,
-    start: Annotated[
-        float | None,
-        typer.Option(
-            "--start",
-            metavar="TIME",
-            parser=offset,
-            help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
-            "holds there.",
-        ),
-    ] = None,
-    baseline: Annotated[
-        Path | None,
-        typer.Option(
-            "--baseline",
-            metavar="FILE.json",
-            rich_help_panel=_GATE,
-            help="Outcomes that are accepted although they are not what was recorded.",
-        ),
-    ] = None,
-    accept: Annotated[
-        bool,
-        typer.Option(
-            "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
-        ),
-    ] = False,
-    junit: Annotated[
-        Path | None,
-        typer.Option(
-            "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
-        ),
-    ] = None,
+    start: _Start = None,
+    baseline: _Baseline = None,
+    accept: _Accept = False,
+    junit: _Junit = None,
     jobs: _Jobs = None,
     repeat: _Repeat = 1,
     make_effects: MakeEffects = False,
     paranoid: Paranoid = False,
-    why: Annotated[
-        bool,
-        typer.Option("--why", metavar=FLAG, help="Find the causes: run each culprit alone, 8 times at most."),
-    ] = False,
+    why: _Why = False,
     quiet: Quiet = False,
-    one_process: Annotated[
-        bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
-    ] = False,
-    process_each: Annotated[
-        bool, typer.Option("--process-each", metavar=FLAG, help="Deprecated: has no effect.")
-    ] = False,
     json: Json = False,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
@@ -165,25 +164,17 @@ def verify(
 
     with friendly_errors():
         only = only or None  # typer gives an empty list where there is none
-        _refuse_deprecated(one_process, process_each, jobs)
+        if jobs is not None and not 1 <= jobs <= MOST_JOBS:
+            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
         if not 1 <= repeat <= MOST_RUNS:
             raise fail(f"--repeat {repeat}: expected 1 to {MOST_RUNS}")
         _refuse_what_excludes(first, only, graph, settings, tolerance, start, baseline, accept=accept)
-        for target in recordings:
-            if not target.is_dir():
-                existing(target, "a recording")
-        if junit is not None:
-            output_file(junit, ".xml", overwrite=True, option="--junit")
-        if baseline is not None:
-            output_file(baseline, ".json", overwrite=True, option="--baseline")
-        with early_workers(1 if one_process else jobs) as early:  # while this process imports what it needs itself
+        _check_files(recordings, junit, baseline)
+        with early_workers(jobs) as early:  # while this process imports what it needs itself
             from dataflow.graph import load_graph
-            from dataflow.verification.gate import Baseline, BaselineError, recordings_in
+            from dataflow.verification.gate import recordings_in
 
-            try:
-                known = None if baseline is None else Baseline.load(baseline)
-            except BaselineError as error:
-                raise fail(str(error)) from None
+            known = None if baseline is None else _loaded(baseline)
             find_modules_in(path)
             loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
             options: dict[str, Any] = {
@@ -193,7 +184,7 @@ def verify(
                 "only": only,
                 "tolerance": tolerance,
                 "start": start,
-                "jobs": 1 if one_process else jobs,
+                "jobs": jobs,
                 "paranoid": paranoid,
                 "make_effects": make_effects,
             }
@@ -205,16 +196,6 @@ def verify(
             if known is not None:
                 _mind_baseline(known, checked, accept=accept, whole=not single)
     raise typer.Exit(_exit_code(checked, known if accept else None))
-
-
-def _refuse_deprecated(one_process: bool, process_each: bool, jobs: int | None) -> None:
-    if one_process and process_each:
-        raise fail("--one-process and --process-each exclude each other")
-    if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
-        raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
-    if one_process or process_each:
-        instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
-        say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
 
 
 def _refuse_what_excludes(
@@ -241,6 +222,25 @@ def _refuse_what_excludes(
         raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
     if accept and (first is not None or only is not None):
         raise fail("--accept takes whole recordings: leave --from and --only out")
+
+
+def _check_files(recordings: list[Path], junit: Path | None, baseline: Path | None) -> None:
+    for target in recordings:
+        if not target.is_dir():
+            existing(target, "a recording")
+    if junit is not None:
+        output_file(junit, ".xml", overwrite=True, option="--junit")
+    if baseline is not None:
+        output_file(baseline, ".json", overwrite=True, option="--baseline")
+
+
+def _loaded(file: Path) -> Baseline:
+    from dataflow.verification.gate import Baseline, BaselineError
+
+    try:
+        return Baseline.load(file)
+    except BaselineError as error:
+        raise fail(str(error)) from None
 
 
 def _check(

@@ -112,7 +112,7 @@ def opened_streams(path: Path, clock: Choice, *, strict: bool = False) -> Record
 
 
 def say_account(opened: Recording | BagStreams, but: Collection[str] = ()) -> None:
-    """Says what was found of a bag, except the lines that are known; some comes to light when messages are read."""
+    """Prints what was found of a bag, except the lines that are known; some comes to light when messages are read."""
     from dataflow.recording import Recording
 
     if isinstance(opened, Recording):
@@ -166,7 +166,7 @@ def open_sink(target: Target, every: float | None = None) -> ViewerSink:
 
 
 class Announcer:
-    """Says once, as soon as the viewer is reached, where to look."""
+    """Prints once, as soon as the viewer is reached, where to look."""
 
     def __init__(self, sink: ViewerSink) -> None:
         self._sink, self._done = sink, False
@@ -187,7 +187,7 @@ class Announcer:
 
 
 def report(done: Drawn, file: Path | None = None) -> None:
-    """Says how much was drawn, and where it is: in `file`, if it was moved there."""
+    """Prints how much was drawn, and where it is: in `file`, if it was moved there."""
     from dataflow.view import Save
 
     sink, drawn = done.sink, done.sink.statistics()

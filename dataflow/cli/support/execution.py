@@ -162,7 +162,7 @@ def _files_of(outputs: Outputs) -> list[Path]:
 
 
 def _written(file: Path) -> tuple[int, int] | None:
-    """Tells one content of a file from another; None where there is no such file."""
+    """Identifies the content of a file; None where there is no such file."""
     return (found.st_ino, found.st_mtime_ns) if file.exists() and (found := file.stat()) else None
 
 

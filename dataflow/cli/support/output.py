@@ -104,7 +104,7 @@ def fail(message: str, *, details: str = "", code: int = COULD_NOT_RUN) -> typer
 
 
 def wants_traceback() -> bool:
-    """Tells whether `dataflow --traceback` or the environment asks for our own tracebacks."""
+    """Returns whether `dataflow --traceback` or the environment asks for our own tracebacks."""
     return os.environ.get(TRACEBACK, "0") not in ("", "0")
 
 
@@ -155,7 +155,7 @@ def _say_notes() -> None:
 
 
 def interrupted_by_user(error: BaseException | None) -> bool:
-    """Tells whether an error is what Python or a library has made of Ctrl-C."""
+    """Returns whether an error is what Python or a library has made of Ctrl-C."""
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or interrupted_by_user(error.__cause__ or error.__context__)
     )
@@ -220,7 +220,7 @@ _FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", 
 
 
 def about_a_file(details: str) -> bool:
-    """Tells whether a traceback ends with a file that is missing or cannot be read; its text may have several lines."""
+    """Returns whether a traceback ends with a file that is missing or unreadable; its text may have several lines."""
     lines = details.rpartition('\n  File "')[2].splitlines()
     raised = next((line for line in lines[1:] if not line.startswith(" ")), "")
     return details.startswith("Traceback") and raised.partition(":")[0].rpartition(".")[2] in _FILE_ERRORS

@@ -42,18 +42,6 @@ def advertised() -> Mapping[str, EntryPoint]:
     return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value))}
 
 
-RENAMED = {"one-host": "one-process", "host-each": "process-each", "patience": "timeout", "streams": "stream"}
-"""Options by their names of the version before, which still work in this one."""
-
-
-@cache
-def renamed(word: str) -> str:
-    """Returns the present name of an option; prints a note, once, where the former one is used."""
-    if word in RENAMED:
-        say(f"[dim]--{word} is now --{RENAMED[word]}; the old name ends with the next version[/]")
-    return RENAMED.get(word, word)
-
-
 class CommandGroup(TyperGroup):
     """The built-in commands, then those of other packages; a built-in command cannot be replaced."""
 

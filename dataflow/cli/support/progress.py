@@ -81,7 +81,7 @@ class RunDisplay:
         return None, 0.0
 
     def reached(self, status: Status) -> str:
-        """Tells how far it has come, in words."""
+        """Returns how far it has come, in words."""
         total, completed = self.fraction(status)
         if self.span is not None and total is not None:
             return f"{completed:.1f} of {total:.1f} s"
@@ -147,7 +147,7 @@ def _share(nanoseconds: int, elapsed: float) -> str:
 
 
 def _lag(counts: OperatorCounts, front: int | None) -> str:
-    """Tells how far an operator is behind the foremost one, in event time."""
+    """Returns how far an operator is behind the foremost one, in event time."""
     if counts.done == FOREVER:
         return "done"
     if counts.done == NEVER or front is None:

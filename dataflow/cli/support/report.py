@@ -194,7 +194,7 @@ def _not_kept(facts: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def is_lacking(facts: Mapping[str, Any]) -> bool:
-    """Tells whether the files of a sink lack anything of what they were to hold."""
+    """Returns whether the files of a sink lack anything of what they were to hold."""
     return bool(facts.get("lost") or facts.get("deaths") or _not_kept(facts))
 
 

@@ -55,7 +55,7 @@ def _meaning(given: Any, kind: Any, param: Any) -> Any:
 
 
 def _plain(word: str, kind: Any) -> bool:
-    """Tells whether the word means a value of that type beyond doubt."""
+    """Returns whether the word means a value of that type beyond doubt."""
     if get_origin(kind) is Literal:
         return word in get_args(kind)
     if kind is Path:

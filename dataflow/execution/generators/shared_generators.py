@@ -62,7 +62,7 @@ class Tripwire:
         self._before = _state() if idle else None
 
     def check(self, source: str) -> None:
-        """Raises `SharedGenerators` if the step has drawn. Says nothing where an operator was at work meanwhile."""
+        """Raises `SharedGenerators` if the step has drawn. Passes where an operator was at work meanwhile."""
         if self._before is None:
             return
         same = _state() == self._before

@@ -120,7 +120,7 @@ def _holds(word: str, leaf: Leaf, inputs: Mapping[str, GraphInput], problems: Pr
 
 
 def given(entry: Choice | Pattern) -> bool:
-    """Tells whether an outer graph has given something, whatever becomes of what makes it."""
+    """Returns whether an outer graph has given something, whatever becomes of what makes it."""
     if isinstance(entry, Pattern):
         return True
     return any(given(inner) for way in entry.ways for inner in way)

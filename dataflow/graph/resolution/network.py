@@ -44,7 +44,7 @@ def _endpoints(tree: Tree | None, what: str, fields: Fields) -> tuple[str, ...]:
 
 
 def _address_fault(endpoint: str) -> str | None:
-    """Says why an endpoint of a protocol with ports cannot be opened; names are not looked up."""
+    """Returns why an endpoint of a protocol with ports cannot be opened; names are not looked up."""
     protocol, _, rest = endpoint.partition("/")
     if protocol not in _WITH_PORT:
         return None

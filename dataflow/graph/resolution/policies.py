@@ -107,7 +107,7 @@ def _wait(tree: Tree, default: int | None, fields: Fields) -> int | None:
 
 
 def default_wait(spec: OperatorSpec, port: InputPort, devices: bool) -> int | None:
-    """Tells how long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
+    """Returns how long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
 
     Fed by a device: 0 for Sampled and Batch and for a single trigger, `JOIN_WAIT` for joined and merged triggers, and
     for a trigger beside a timer the timer's period, if that is less: else a tick would shut out messages of its stamp.

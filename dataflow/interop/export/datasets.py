@@ -200,7 +200,7 @@ def _write_poses(
 
 
 def tell_untaken(material: Material, what: str, done: Exported) -> None:
-    """Says which streams and topics a dataset has no place for."""
+    """Reports which streams and topics a dataset has no place for."""
     for name, outside in material.names.items():
         if outside not in done.written and outside not in done.left_out:
             kind = material.streams[name].message_type

@@ -82,7 +82,7 @@ def carry(material: Material, writer: Writer, done: Exported, *, without: Collec
 
 
 def tell_left_out(material: Material, what: str, done: Exported) -> None:
-    """Says which attachments and metadata records a format has no place for."""
+    """Reports which attachments and metadata records a format has no place for."""
     extras = Extras(material)
     for name in extras.names:
         done.left_out[f"attachment {name}"] = f"{what} has no place for it"

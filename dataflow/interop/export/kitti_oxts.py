@@ -95,7 +95,7 @@ def packet_of(imu: Imu, fix: NavSatFix, odometry: Odometry) -> list[float]:
 
 
 def _fault(imu: Imu, fix: NavSatFix, odometry: Odometry) -> str:
-    """Tells what keeps these three from being a packet; empty where nothing does."""
+    """Returns what keeps these three from being a packet; empty where nothing does."""
     if imu.orientation is None:
         return "an Imu without an orientation to east, north and up"
     if odometry.linear is None:

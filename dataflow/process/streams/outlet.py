@@ -120,7 +120,7 @@ class Outlet:
                 self._send_bytes(key, said)
 
     def _say_left(self, stream: str, place: Place) -> None:
-        """Says how far an incarnation of a stream has got that is over: who lacks messages of it has lost them."""
+        """Announces how far an ended incarnation of a stream got: messages that a subscriber lacks are lost."""
         if stream not in self._static:
             self._send(stream, Envelope(Kind.FRONTIER, stream, *place, NEVER), droppable=False)
 
@@ -149,7 +149,7 @@ class Outlet:
                 self.sent += 1
 
     def push_all(self) -> None:
-        """Waits (bounded) until everything has room: before this process leaves. Says what is lost."""
+        """Waits (bounded) until everything has room: before this process leaves. Reports what is lost."""
         clock = AwakeClock()
         deadline = clock() + PUSH_WITHIN
         while not self._fanout.flush():

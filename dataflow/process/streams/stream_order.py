@@ -23,7 +23,7 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Says what follows from one envelope."""
+    """Returns what follows from one envelope."""
 
     taken: Envelope | None = None
     """The envelope to take in its place; None: it does not count."""

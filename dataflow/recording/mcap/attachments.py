@@ -97,7 +97,7 @@ def _text(record: bytes, at: int) -> tuple[str, int]:
 
 
 def tells_of_run(name: str) -> bool:
-    """Tells whether metadata of this name describe a run of a graph, or a recording of ours: its writer wrote them."""
+    """Returns whether metadata of this name describe a run of a graph, or a recording of ours."""
     return name in FACTS or name.startswith("dataflow:")
 
 

@@ -61,7 +61,7 @@ class ChunkIndexes:
 
     @property
     def ordered(self) -> bool:
-        """Tells whether no chunk begins before the one in front of it."""
+        """Returns whether no chunk begins before the one in front of it."""
         return all((np.diff(self.firsts[k : k + SEGMENT + 1]) >= 0).all() for k in range(0, len(self), SEGMENT))
 
     def holding(self, channels: npt.ArrayLike, start: int | None = None, end: int | None = None) -> Iterator[Column]:

@@ -189,7 +189,7 @@ def _unpack_lz4(packed: memoryview, most: int) -> bytes:
 
 
 def _whole_records(data: bytes) -> int:
-    """Tells how many bytes of records are whole at the beginning of `data`."""
+    """Returns how many bytes of records are whole at the beginning of `data`."""
     end = 0
     while end + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, end)

@@ -105,7 +105,7 @@ class ContainerWriter:
 
     @property
     def failed(self) -> bool:
-        """Tells whether a write has failed, so that nothing more can be added."""
+        """Returns whether a write has failed, so that nothing more can be added."""
         return self._failure is not None
 
     @property

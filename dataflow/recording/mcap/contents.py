@@ -92,7 +92,7 @@ class Contents:
         return {channel: growing.done() for channel, growing in self._growing.items()}
 
     def counts(self) -> dict[int, int]:
-        """Tells how many messages were found, by channel."""
+        """Returns how many messages were found, by channel."""
         return {channel: len(growing.times) for channel, growing in self._growing.items()}
 
     def undeclared(self) -> list[int]:

@@ -97,7 +97,7 @@ class McapFile:
 
     @property
     def own(self) -> bool:
-        """Tells whether this program wrote the file, or another one made it of such a file."""
+        """Returns whether this program wrote the file, or another one made it of such a file."""
         return self.header.library.startswith(PROGRAM) or any(name == RECORDING for name, _ in self.metadata)
 
     @property

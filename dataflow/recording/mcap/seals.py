@@ -32,7 +32,7 @@ def sealed(record: bytes) -> bytes:
 
 
 def seal_of(record: bytes) -> Seal:
-    """Tells whether a whole record, opcode and length included, is as it was sealed."""
+    """Returns whether a whole record, opcode and length included, is as it was sealed."""
     if len(record) < _RECORD.size + _SEAL.size:
         return Seal.ABSENT
     tag, crc = _SEAL.unpack_from(record, len(record) - _SEAL.size)

@@ -69,7 +69,7 @@ class Origin:
         return int(text) if text.isdecimal() else 0
 
     def is_static(self, channel: Channel) -> bool:
-        """Tells whether the stream of a channel is one message, valid always."""
+        """Returns whether the stream of a channel is one message, valid always."""
         return self.own and any(
             c.metadata.get("static") == "true" for c in self.channels.values() if c.topic == self.stream(channel)
         )

@@ -264,7 +264,7 @@ def _field_difference(
 
 
 def _unequal(left: npt.NDArray[Any], right: npt.NDArray[Any], tolerance: float | None) -> npt.NDArray[np.bool_]:
-    """Tells which elements of two arrays of one shape and type differ, flat: beyond the tolerance, or in any bit."""
+    """Returns which elements of two arrays of one shape and type differ, flat: beyond the tolerance, or in any bit."""
     if tolerance is not None and left.dtype.kind == "f":
         x, y = left.reshape(-1).astype(np.float64), right.reshape(-1).astype(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -225,7 +225,7 @@ def _base64(data: npt.NDArray[Any]) -> str | _Long:
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:
-    """Tells whether JSON numbers hold every element."""
+    """Returns whether JSON numbers hold every element."""
     if data.dtype.kind == "f":
         return bool(np.isfinite(data).all())
     if data.dtype.itemsize == 8 and data.size:

@@ -35,7 +35,7 @@ NOTHING_IN_IT = "holds nothing: its writer died as it began the file"
 
 
 def holds_nothing(file: McapFile | PartedFile) -> bool:
-    """Tells whether the writer of a file died before it had stored a message or a record, or could store nothing."""
+    """Returns whether the writer of a file died before it had stored a message or a record, or could store nothing."""
     blank = not (file.channels or file.metadata or file.attachments)
     return (file.torn or blank) and not any(map(file.index.count, file.channels))
 

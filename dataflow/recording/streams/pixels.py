@@ -55,12 +55,12 @@ _PLANES = {"nv12": (3, 2), "nv21": (3, 2), "nv24": (3, 1)}
 
 
 def is_depth(encoding: str) -> bool:
-    """Tells whether an encoding holds distances: floats in metres, or 16-bit millimetres (REP 118)."""
+    """Returns whether an encoding holds distances: floats in metres, or 16-bit millimetres (REP 118)."""
     return encoding in DEPTH_ENCODINGS
 
 
 def is_16_bit(encoding: str) -> bool:
-    """Tells whether an encoding holds colours or greys of 16 bits; `16UC1` is depth (REP 118)."""
+    """Returns whether an encoding holds colours or greys of 16 bits; `16UC1` is depth (REP 118)."""
     return encoding in _IMAGES_16
 
 

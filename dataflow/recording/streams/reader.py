@@ -67,7 +67,7 @@ class Recording:
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end: it is being written, or its writer died. The rest can be read."""
+        """Returns whether the file has no proper end: it is being written, or its writer died. The rest can be read."""
         return self._file.torn
 
     @property

@@ -72,13 +72,13 @@ class StreamInfo:
 
     @property
     def generic(self) -> bool:
-        """Tells whether its messages are read by the recording's declaration, without the class that made them."""
+        """Returns whether its messages are read by the recording's declaration, without the class that made them."""
         found = self.message_type
         return found is not None and issubclass(found, GenericMessage)
 
     @property
     def declared_otherwise(self) -> bool:
-        """Tells whether the type's declaration in this program differs from the one that the messages were written
+        """Returns whether the type's declaration in this program differs from the one that the messages were written
         with."""
         if self.declaration is not None:
             return self.generic and registered_type(self.declaration.schema) is not None

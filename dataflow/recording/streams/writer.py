@@ -112,7 +112,7 @@ class RecordingWriter:
 
     @property
     def closed(self) -> bool:
-        """Tells whether it was closed."""
+        """Returns whether it was closed."""
         return self._file.closed
 
     @property
@@ -127,7 +127,7 @@ class RecordingWriter:
 
     @property
     def failed(self) -> bool:
-        """Tells whether a write has failed: nothing more can be added."""
+        """Returns whether a write has failed: nothing more can be added."""
         return self._file.failed
 
     def saved(self, stream: str) -> int:

@@ -66,8 +66,8 @@ def _serve_apart(slot: Slot, slots: Sequence[Slot], parent: int) -> int:
 
 
 def serve(slot: Slot) -> int:
-    """Tells that it waits; when it may go, makes the call that the file holds and puts the answer in its place. Returns
-    the exit code."""
+    """Announces that it waits; when it may go, makes the call that the file holds and puts the answer in its place.
+    Returns the exit code."""
     descriptor, letter, board, *_ = slot
     channel = Channel(descriptor)
     try:

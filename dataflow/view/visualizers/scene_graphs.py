@@ -209,6 +209,6 @@ def _axes_of(message: SceneGraph, node: int) -> npt.NDArray[np.float64]:
 
 
 def _moved(canvas: Canvas, what: str, arrays: Sequence[npt.NDArray[np.float64]]) -> bool:
-    """Tells whether what is drawn differs from the last drawing by more than can be seen."""
+    """Returns whether what is drawn differs from the last drawing by more than can be seen."""
     cells = tuple(tuple(np.round(np.asarray(a, np.float64) / _STILL).ravel().tolist()) for a in arrays)
     return canvas.scene.changed(canvas.entity, what, cells)

@@ -56,7 +56,7 @@ def joint_state(canvas: Canvas, message: JointState) -> None:
             canvas.plot(what, values, message.names)
 
 
-@visualizer(Diagnostics, "status", "log", "plot")
+@visualizer(Diagnostics, "status", "log", "plot", plots=("latency", "rate", "value"))
 def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
     """A lane from green to red for each status, a line of text when it changes by more than its numbers, and curves.
 
@@ -75,6 +75,7 @@ def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
             number = _number(value)
             if number is None:
                 continue
+            canvas.begin(f"plot/{_kind(key)}")
             path = "/".join(("plot", _kind(key), *map(rr.escape_entity_path_part, (name, key))))
             if canvas.scene.changed(canvas.entity, path, True):
                 canvas.log(path, rr.SeriesLines(names=f"{name} {key}"), static=True)
@@ -82,7 +83,7 @@ def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
 
 
 def _kind(key: str) -> str:
-    """Tells which plot a value belongs to: the same unit, more or less."""
+    """Returns which plot a value belongs to: the same unit, more or less."""
     lower = key.lower()
     if _RATE.search(lower):
         return "rate"

@@ -143,7 +143,7 @@ def _box(where: str, box: Any, size: tuple[int, int]) -> list[float]:
 
 
 def _is_flat(annotation: Mapping[str, Any]) -> bool:
-    """Tells whether a box has no width or no height, as two of COCO's own have: nothing can be learnt from it."""
+    """Returns whether a box has no width or no height, as two of COCO's own have: nothing can be learnt from it."""
     box = annotation.get("bbox")
     if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
         return False

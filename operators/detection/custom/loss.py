@@ -39,7 +39,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """Says who answers for whom in one map: entries of (image, anchor, row, column) and the object (index into
+    """Assigns anchors of one map to objects: entries of (image, anchor, row, column) and the object (index into
     Truth)."""
 
     image: Tensor
@@ -146,7 +146,7 @@ def _flat_index(at: tuple[Tensor, Tensor, Tensor, Tensor], shape: torch.Size) ->
 
 @torch.no_grad()
 def _ignored(boxes: Tensor, objectness: Tensor, truth: Truth, stride: int) -> Tensor:
-    """Tells which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an
+    """Returns which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an
     object.
 
     Those that are sure enough to be empty are not compared: most are, and the comparison costs more than the network.

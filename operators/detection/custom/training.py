@@ -66,7 +66,7 @@ def fit_anchors(sizes: Sizes, count: int, seed: int, rounds: int = 50) -> Sizes:
 
 
 def mean_best_iou(sizes: Sizes, anchors: Sizes) -> float:
-    """Tells how well the anchors cover the sizes: the mean over objects of the best anchor's IoU."""
+    """Returns how well the anchors cover the sizes: the mean over objects of the best anchor's IoU."""
     return float(size_iou(np.asarray(sizes, np.float32), anchors).max(axis=1).mean())
 
 

@@ -106,7 +106,7 @@ def _labelled(image: Path, classes: int, names_file: Path) -> LabelledImage:
 
 
 def label_file(image: Path) -> Path:
-    """Tells where the labels of an image lie: the last `images` of its path is `labels`, else beside it."""
+    """Returns where the labels of an image lie: the last `images` of its path is `labels`, else beside it."""
     parts = list(image.parts)
     for i in range(len(parts) - 2, -1, -1):
         if parts[i] == "images":

@@ -15,7 +15,7 @@ from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampl
 from operators.fusion.redundant.combination import Bearing, Place, Unknown, place_consistency, place_misfits, placed
 from operators.fusion.redundant.sensors import RedundantSensors
 from operators.geometry.extrinsics import transform_between
-from operators.localization.reading import cartesian
+from operators.localization.interpretation import cartesian
 
 Array = NDArray[np.float64]
 

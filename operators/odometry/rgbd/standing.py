@@ -1,4 +1,4 @@
-"""Tells what stands still from what has moved, among features that a recognised view has in common with the map.
+"""Separates what stands still from what has moved, among features that a recognised view has in common with the map.
 
 Points of both agree by a decimetre, so one pose between two may fit a wall and a robot before it that has moved by less
 than a metre. Their pixels and depths together agree far closer, on one body alone: the one of the largest surface

@@ -27,7 +27,7 @@ _SPAN = 0.5  # seconds
 _DOUBT = 0.01  # what a look leaves to an activity at least
 
 
-class Looks(Remembered):
+class PostureWindow(Remembered):
     """Looks at a posture in the last half second; each gives probabilities of activities."""
 
     _taken: deque[tuple[float, F32]]
@@ -67,7 +67,7 @@ class _Agent:
     stepped: int | None
     activity: str
     since: int
-    looks: Looks
+    looks: PostureWindow
 
 
 @dataclass
@@ -79,7 +79,7 @@ class State(Counts):
 
 
 class ActivityRecognizer(Operator):
-    """Says what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
+    """Recognises what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
 
     A vector of an agent's motion in the last 2.5 s, its extent and the seats, tables and drinks around it goes at each
     graph into two LSTM layers. Their state is kept for as long as the agent is in the scene, and goes on by steps of
@@ -151,7 +151,7 @@ class ActivityRecognizer(Operator):
         return self._answer(nodes.stamp, agents, vectors, seen)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Looks())
+        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, PostureWindow())
 
     def _looks(self, postures: Classification) -> dict[int, NDArray[np.float32]]:
         """Returns what each posture speaks for, by ids: probabilities (C,) of our activities.

@@ -24,7 +24,7 @@ _APART = 0.5  # metres on the ground between a node and the points that are of i
 
 
 class PostureRecognizer(Operator):
-    """Says what the posture of each person of a scene looks like, by one look of the depth sensor.
+    """Classifies the posture of each person of a scene by one look of the depth sensor.
 
     The points of each person in view are drawn as a silhouette of 64x64 cells, with relative depth and with the points
     before and behind the person; a small network classifies it as standing, walking, sitting down, sitting, standing

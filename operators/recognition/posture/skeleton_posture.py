@@ -16,7 +16,7 @@ _SIDES = ("left", "right")
 
 
 class SkeletonPosture(Operator):
-    """Says whether people stand or sit, by their joints in the image: no network but that of the keypoints is used.
+    """Classifies people as standing or sitting by their joints in the image, without a further network.
 
     The thigh of a person who stands goes on from the trunk; that of one who sits leaves its direction, or points at the
     camera and is short. So the length of the thigh along the trunk is compared with the trunk's, whatever the roll of

@@ -104,7 +104,7 @@ class SceneGraphBuilder(Operator):
         return State(graph=LayeredGraph(settings))
 
     def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so does the graph."""
+        """Starts the graph again: the clock of an input was reset."""
         super().on_reset(input)
         self._bodies, self._plan = BodyMemory(self._labels), None
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.scene_summary import ROOMS, summarize
+from operators.labels import LabelSpace
 from operators.scene.map.map_surface import SURFACES
-from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM, SYMMETRIC
+from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM, SYMMETRIC, TABLETOP
 
 _ANY = ("anything", "something", "thing", "*")
 _PHRASES = {p.replace("_", " "): p for p in (*PREDICATES, *INVERSES)}
@@ -39,11 +40,12 @@ _MEANT = {
     "going to": "heads for",
 }
 """Relations as people call them, with the one that is nearest in meaning: what an error proposes."""
+_NO_LABELS = LabelSpace("none")
 _LAYERS = {ROOM: "room", FLOOR: "surface", ROBOT: "robot"}
 
 
 class QueryError(ValueError):
-    """Tells what in a question is not understood, and what would be."""
+    """Explains what in a question is not understood, and what would be."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,8 @@ class Match:
 
 
 def parse(text: str, classes: Sequence[str]) -> tuple[str, list[Clause]]:
-    """Returns the class that is asked for and the conditions on it: `mug on table near person` asks for a mug that is
-    on a table and near a person.
+    """Returns the class that is asked for and the conditions on it, by names of `classes`: `mug on table near person`
+    asks for a mug that is on a table and near a person.
 
     A class may be `anything`, or name a node with its number, as `table 3`; `not on table` asks for none. Relations are
     written with blanks or `_`. Raises QueryError, which proposes the relation nearest in meaning or spelling.
@@ -126,20 +128,24 @@ def _noun(words: Sequence[str], k: int, classes: Sequence[str]) -> tuple[str, in
     raise QueryError(f"{words[k]!r} is no class of this graph{hint}")
 
 
-def ask(graph: SceneGraph, text: str) -> list[Match]:
-    """Returns the nodes that a question asks for, likeliest first. Raises QueryError."""
-    subject, clauses = parse(text, graph.class_names)
+def ask(graph: SceneGraph, text: str, labels: LabelSpace = _NO_LABELS) -> list[Match]:
+    """Returns the nodes that a question asks for, likeliest first. Raises QueryError.
+
+    Classes have their own names and those that the label space gives them. `on` a class whose role is `support`
+    includes on a table top, since the thing below it may be unseen.
+    """
+    subject, clauses = parse(text, list(dict.fromkeys([*graph.class_names, *labels.names(graph.class_names)])))
+    asked = _meant(subject, graph, labels)
+    conditions = [(clause, _meant(clause.object, graph, labels, on=clause.predicate == "on")) for clause in clauses]
     scores = graph.relation_scores if graph.relation_scores is not None else [1.0] * len(graph.predicates)
     held = [(*triple, float(score)) for triple, score in zip(graph.relations(), scores, strict=True)]
     matches = []
-    for node in range(graph.count):
-        if not _named(graph, node, subject):
-            continue
+    for node in sorted(asked):
         score = 1.0 if graph.scores is None else float(graph.scores[node])
         because: list[tuple[int, str, int]] = []
         fits = True
-        for clause in clauses:
-            found = [row for row in held if _fits(graph, row, node, clause)]
+        for clause, others in conditions:
+            found = [row for row in held if _fits(row, node, clause.predicate, others)]
             fits = fits and bool(found) == clause.wanted
             if found and clause.wanted:
                 best = max(found, key=lambda row: row[3])
@@ -150,24 +156,30 @@ def ask(graph: SceneGraph, text: str) -> list[Match]:
     return sorted(matches, key=lambda m: (-m.score, int(graph.ids[m.node])))
 
 
-def _fits(graph: SceneGraph, row: tuple[int, str, int, float], node: int, clause: Clause) -> bool:
+def _fits(row: tuple[int, str, int, float], node: int, predicate: str, others: set[int]) -> bool:
+    """Returns whether a relation is one of a node, by a predicate or its inverse, to one of the others."""
     s, p, o, _ = row
-    wanted = INVERSES.get(clause.predicate, clause.predicate)
-    turned = clause.predicate in INVERSES
-    if p != wanted:
+    if p != INVERSES.get(predicate, predicate):
         return False
-    if (s == node and not turned and _named(graph, o, clause.object)) or (
-        o == node and turned and _named(graph, s, clause.object)
-    ):
-        return True
-    return p in SYMMETRIC and o == node and _named(graph, s, clause.object)
+    turned = predicate in INVERSES
+    forth, back = s == node and o in others, o == node and s in others
+    return (back if turned else forth) or (back and p in SYMMETRIC)
 
 
-def _named(graph: SceneGraph, node: int, name: str) -> bool:
-    label = graph.class_names[graph.class_ids[node]] if graph.class_names else str(graph.class_ids[node])
+def _meant(name: str, graph: SceneGraph, labels: LabelSpace, *, on: bool = False) -> set[int]:
+    """Returns the nodes, by index, of a class or, with a number behind its name, the one; `on`: those to stand on."""
     if name == "*":
-        return int(graph.ids[node]) not in (ROOM, ROBOT)
-    return name in (label, f"{label} {int(graph.ids[node])}", *graph.labels[node : node + 1])
+        return {k for k, id in enumerate(graph.ids.tolist()) if id not in (ROOM, ROBOT)}
+    called, number = labels.called(name, graph.class_names), ""
+    if not called:
+        name, _, number = name.rpartition(" ")
+        called = labels.called(name, graph.class_names)
+    elif on and "support" in labels.roles(name):
+        called.append(TABLETOP)
+    wanted = {f"{each} {number}".rstrip() for each in called}
+    named = zip(graph.class_ids.tolist(), graph.ids.tolist(), graph.names(), strict=True)
+    classes = graph.class_names
+    return {k for k, (c, id, own) in enumerate(named) if wanted & {classes[c], f"{classes[c]} {id}", own}}
 
 
 def as_json(graph: SceneGraph, activities: Activity | None = None) -> dict[str, Any]:

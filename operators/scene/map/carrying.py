@@ -56,7 +56,7 @@ def carried(
 
 
 def in_hand(place: Array, bodies: Sequence[MapObject]) -> bool:
-    """Tells whether a place (3,) is where one of these bodies has its hands."""
+    """Returns whether a place (3,) is where one of these bodies has its hands."""
     for body in bodies:
         c, s = np.cos(body.yaw), np.sin(body.yaw)
         x, y, z = (place - body.center).tolist()

@@ -144,7 +144,7 @@ class Cells:
             self.other[rows[~shown.near_each(self.points[rows], reach)]] += weight
 
     def near_each(self, points: Array, distance: float) -> NDArray[np.bool_]:
-        """Tells which points (N, 3) lie within a distance of a voxel's mean."""
+        """Returns which points (N, 3) lie within a distance of a voxel's mean."""
         if len(points) * len(self) <= _FEW:  # sooner compared each with each than put into a tree
             square = np.zeros((len(points), len(self)))
             for axis in range(3):

@@ -18,7 +18,7 @@ _ODD = 4.0  # spreads above the usual size, from which an object is doubted
 
 
 class Kinds:
-    """Tells of objects and classes what follows from which classes move and which sizes are usual."""
+    """Derives for objects and classes what follows from which classes move and which sizes are usual."""
 
     @classmethod
     def of(cls, labels: LabelSpace, classes: Sequence[str]) -> Kinds:
@@ -45,22 +45,22 @@ class Kinds:
         }
 
     def is_mover(self, object: MapObject) -> bool:
-        """Tells whether an object is of a class that moves by itself; small ones do only while they are moved."""
+        """Returns whether an object is of a class that moves by itself; small ones do only while they are moved."""
         return object.class_id in self.movers and not self.is_still(object)
 
     def is_still(self, object: MapObject) -> bool:
-        """Tells whether an object is small and lies still, so that it may be of a class that moves or not."""
+        """Returns whether an object is small and lies still, so that it may be of a class that moves or not."""
         size, class_id = object.longest, object.class_id
         if class_id in self.movers:
             size = max(size, self._largest[class_id])
         return size <= _SMALL and max(map(abs, object.velocity.tolist())) <= _STILL
 
     def may_leave(self, object: MapObject) -> bool:
-        """Tells whether an object is small, and of a class that moves by itself or is taken away in hands."""
+        """Returns whether an object is small, and of a class that moves by itself or is taken away in hands."""
         return object.longest <= _SMALL and (object.class_id in self.movers or object.class_id in self.portable)
 
     def is_large(self, object: MapObject) -> bool:
-        """Tells whether things of an object's class are seldom seen whole."""
+        """Returns whether things of an object's class are seldom seen whole."""
         usual = self.usual.get(object.class_id)
         return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
 

@@ -118,7 +118,7 @@ def alike(
 
 
 def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
-    """Tells of observations (N) and boxes (M, 7), centre, size and heading, which are not too far apart to be `alike`.
+    """Returns which of the observations (N) are near enough to boxes (M, 7), centre, size, heading, to be `alike`.
 
     A micrometre more passes: `alike` decides.
     """
@@ -164,7 +164,7 @@ def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_
 
 
 def in_places_of_their_own(images: Sequence[ImageView]) -> NDArray[np.bool_]:
-    """Tells of each two of images of one view (N, N) whether neither covers the other's place."""
+    """Returns of each two of images of one view (N, N) whether neither covers the other's place."""
     boxes = np.stack([image.box for image in images])
     low, high = (side(boxes[:, None], boxes[None]) for side in (np.maximum, np.minimum))
     shared = np.maximum(high[..., 2:] - low[..., :2], 0).prod(axis=2)

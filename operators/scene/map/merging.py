@@ -23,7 +23,7 @@ _SELDOM = 0.15  # share of the views in which both are seen beside each other, f
 
 
 def may_be_one(known: Sequence[MapObject], rows: NDArray[np.intp], kinds: Kinds) -> NDArray[np.bool_]:
-    """Tells of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
+    """Returns of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
     low, high = (np.array([each.cells.bounds[side] for each in known]).T for side in (0, 1))
     movers = np.array([kinds.is_mover(each) for each in known])
     apart = np.maximum(low[:, rows, None], low[:, None]) - np.minimum(high[:, rows, None], high[:, None])
@@ -31,7 +31,7 @@ def may_be_one(known: Sequence[MapObject], rows: NDArray[np.intp], kinds: Kinds)
 
 
 def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
-    """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
+    """Returns whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
     apart = a.cells.apart(b.cells)
     if apart > _NEAR_MOVERS:
         return False

@@ -361,7 +361,7 @@ def _log_odds(score: float, least: float) -> float:
 
 
 def _moved(old: MapObject, new: MapObject) -> bool:
-    """Tells whether a new object is an old one of its class in another place: of its size and colour."""
+    """Returns whether a new object is an old one of its class in another place: of its size and colour."""
     sizes = np.sort(old.size[:2]), np.sort(new.size[:2])
     fits = np.abs(sizes[0] - sizes[1]).max() <= 0.1 + 0.4 * sizes[0].max()
     fits &= abs(old.size[2] - new.size[2]) <= 0.1 + 0.3 * old.size[2]

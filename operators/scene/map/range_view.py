@@ -86,7 +86,7 @@ class RangeView:
         return Sight(looked, free, confirmed)
 
     def may_show(self, centers: Array, radii: Array) -> Mask:
-        """Tells which spheres (N,) are at least partly in the directions and the range that the view covers."""
+        """Returns which spheres (N,) are at least partly in the directions and the range that the view covers."""
         column, row, ranges = self._directions(self._in_sensor(centers))
         if not len(self._nearest):
             return np.zeros(len(centers), np.bool_)
@@ -100,7 +100,7 @@ class RangeView:
         return np.asarray(((turned & raised) | (ranges <= radii)) & (ranges <= self.reach + radii))
 
     def of_each(self, places: Sequence[Array], margin: float) -> list[Sight]:
-        """Tells the same of each of several sets of places."""
+        """Returns the same of each of several sets of places."""
         if not places:
             return []
         whole = self.of(np.concatenate(places), margin)

@@ -102,7 +102,7 @@ class Trajectory(Remembered):
 
 
 def _near(first: Matrix, second: Matrix) -> bool:
-    """Tells whether a pose is hardly different from another."""
+    """Returns whether a pose is hardly different from another."""
     moved = float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
     cosine = (float(np.trace(first[:3, :3].T @ second[:3, :3])) - 1) / 2
     return moved < _STEP and cosine > np.cos(_TURN)

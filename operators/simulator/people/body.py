@@ -57,7 +57,7 @@ class Body:
         return np.asarray(posture.pelvis + self.height * (_TORSO + _NECK) * spine + 0.05 * up + 0.13 * forward)
 
     def grip(self, posture: Posture, side: int) -> Array:
-        """Tells where the hand really is: its target, or as near to it as the arm reaches."""
+        """Returns where the hand really is: its target, or as near to it as the arm reaches."""
         _, _, end = self._arm(posture, side)
         return end
 

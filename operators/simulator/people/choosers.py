@@ -98,7 +98,7 @@ def add_chooser(builder: Builder, rng: Rng, wall: Wall, low: float, high: float)
 
 
 def _is(state: Callable[[float], object], value: object, t: float) -> bool:
-    """Tells whether a state has a value at a time."""
+    """Returns whether a state has a value at a time."""
     return state(t) == value
 
 

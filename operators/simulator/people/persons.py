@@ -48,7 +48,7 @@ class Person:
         return act.seat if act.sit == (1.0, 1.0) else None
 
     def grip(self, t: float) -> Array:
-        """Tells where the reaching hand is."""
+        """Returns where the reaching hand is."""
         return self.body.grip(self.posture(t), self._hand)
 
     def posture(self, t: float) -> Posture:
@@ -118,7 +118,7 @@ class Person:
     def _hands(
         self, pelvis: Array, forward: Array, left: Array, sit: float, swing: Array, yaw: float, lean: float
     ) -> Array:
-        """Tells where hands are when they do nothing: hanging, or on the thighs."""
+        """Returns where hands are when they do nothing: hanging, or on the thighs."""
         hands = np.zeros((2, 3))
         bare = Posture(pelvis, yaw, lean, np.zeros((2, 3)), np.zeros((2, 3)))
         for side in (0, 1):

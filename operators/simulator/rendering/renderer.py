@@ -160,7 +160,7 @@ class Renderer:
         return Hits(distance, normals, things.astype(np.int32), tint.mean(axis=1).astype(np.float32) / 255)
 
     def blocked(self, rays: F32) -> NDArray[np.bool_]:
-        """Tells whether something lies on each ray (N, 6) before its direction's full length."""
+        """Returns whether something lies on each ray (N, 6) before its direction's full length."""
         return np.asarray(self.cast(rays).distance < 1.0)
 
     def silhouette(self, things: list[int], T_world_camera: Array, optics: Optics) -> Array:

@@ -103,7 +103,7 @@ class Rig:
         return messages
 
     def _smear(self, t: float, camera: settings.ColorCamera, T_base_camera: Array) -> tuple[float, float]:
-        """Tells how far the image moves while the shutter is open, in pixels: by the robot's turning alone."""
+        """Returns how far the image moves while the shutter is open, in pixels: by the robot's turning alone."""
         omega = T_base_camera[:3, :3].T @ self.stage.drive.state(t).angular
         focal, seconds = self._color_optics.fx, camera.shutter * 1e-9
         return -focal * omega[1] * seconds, focal * omega[0] * seconds

@@ -193,7 +193,7 @@ operators:
 def test_a_graph_with_two_cameras_is_recorded_and_verifies(checkpoints: dict[str, str], tmp_path: Path) -> None:
     graph, file = tmp_path / "rig.yaml", tmp_path / "rig.mcap"
     graph.write_text(GRAPH.format(model=SSD, file=checkpoints[SSD]))
-    for words in (("run", graph, "--one-process", "--record", file), ("verify", file, "--one-process", "--json")):
+    for words in (("run", graph, "--one-process", "--record", file), ("verify", file, "--jobs", 1, "--json")):
         done = subprocess.run(
             [sys.executable, "-m", "dataflow.cli.main", *map(str, words), "-q"],
             capture_output=True,

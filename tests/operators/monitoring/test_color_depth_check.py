@@ -182,6 +182,20 @@ def test_calibration_brings_the_camera_nearer_step_by_step() -> None:
     assert float(told[1]) == pytest.approx(100 * (away[-1] - away[0]), abs=0.2)
 
 
+def test_edges_come_nearer_where_a_turn_fits_about_as_well_as_a_displacement() -> None:
+    """Either puts them where they should be, at the distances that are seen."""
+    _, given = finding(ColorDepthCheck(period="200ms", calibrate=True), displaced(0.05))
+    assert len(given) == 2
+    off = []
+    for known in given:
+        alignment, T = EdgeAlignment(), transform_between(known, "depth", "color")
+        for image, depth in zip(*pairs(), strict=True):
+            alignment.add(image.data, K, rims(depth.data, K) @ T[:3, :3].T + T[:3, 3])
+        off.append(abs(alignment.shifts()[0].x))
+    assert off[0] >= 3
+    assert off[1] <= 0.7 * off[0]
+
+
 def test_what_was_corrected_is_found_though_all_fits_since() -> None:
     check = ColorDepthCheck(period="200ms", calibrate=True)
     text, given = finding(check, extrinsics(color=("y", -3.0)))

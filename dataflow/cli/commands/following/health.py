@@ -26,7 +26,7 @@ from dataflow.cli.support.output import (
 )
 
 if TYPE_CHECKING:
-    from dataflow.cli.support.board import Row
+    from dataflow.cli.support.status_table import Row
     from dataflow.client.processes import ProcessStatus
     from dataflow.graph.model import Graph
 
@@ -75,7 +75,7 @@ def health(
       dataflow health
       dataflow health --rate camera=25 --rate detector=8 --folder out --free 5
     """
-    from dataflow.cli.support.board import Board
+    from dataflow.cli.support.status_table import StatusTable
     from dataflow.client.attach import graph_of
     from dataflow.client.processes import processes_of
 
@@ -83,13 +83,13 @@ def health(
         found = running_graph(graph, wait)
         resolved = graph_of(found)
         least = _rates(rate or (), resolved.nodes)
-        board = Board(resolved)
+        table = StatusTable(resolved)
         with processes_of(found) as processes:
             processes.connected(len(found.endpoints), CONNECT_WITHIN)
-            before = board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+            before = table.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
             time.sleep(over)
             statuses = processes.statuses(ANSWER_WITHIN)
-            sample = board.update(statuses, time.monotonic())
+            sample = table.update(statuses, time.monotonic())
         reasons = [
             *faults(before.rows, sample.rows, least=least, losses=losses),
             *silent(resolved, statuses, time.time() - found.started, over),

@@ -6,7 +6,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -82,7 +82,7 @@ def followed_graph(name: str | None, wait: float) -> RunningGraph:
 
 
 def say_followed(found: RunningGraph) -> None:
-    """Says which running graph a command follows."""
+    """Prints which running graph a command follows."""
     say(f"following {escape(found.name)} (process {found.pid})")
 
 
@@ -288,10 +288,6 @@ def hz(
       dataflow hz camera/image --window 2
       dataflow hz --seconds 5 --json
     """
-    from rich.live import Live
-
-    from dataflow.client.attach import still_runs
-
     if duration is not None and not 0 < duration < 1e9:
         raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
     if window is not None and not 0 < window < 1e9:
@@ -300,34 +296,46 @@ def hz(
     stopped = False
     with friendly_errors(), tapped(streams, graph, wait) as (found, client):
         deadline = None if duration is None else time.monotonic() + duration
-        live = None if json or not out.is_terminal else Live(console=out, auto_refresh=False, transient=True)
-        due = 0.0
         try:
-            if live is not None:
-                live.start()
-            while deadline is None or time.monotonic() < deadline:
-                taken = client.take(timeout=0.25)
-                if taken is not None:
-                    _take_rate(rates, taken)
-                elif not still_runs(found):
-                    break
-                if window is not None:
-                    for rate in rates.values():
-                        rate.forget_before(time.monotonic() - window)
-                if live is not None and time.monotonic() >= due:
-                    due = time.monotonic() + 0.25
-                    live.update(_rate_table(rates, found.namespace), refresh=True)
+            _measure(rates, found, client, deadline, window, shown=not json and out.is_terminal)
         except KeyboardInterrupt:
             stopped = True
-        finally:
-            if live is not None:
-                live.stop()
     if json:
         print_json([rate.row(stream) for stream, rate in sorted(rates.items())])
     else:
         out.print(_rate_table(rates, found.namespace))
     if stopped:
         raise typer.Exit(INTERRUPTED)
+
+
+def _measure(
+    rates: dict[str, _Rate],
+    found: RunningGraph,
+    client: TapClient,
+    deadline: float | None,
+    window: float | None,
+    *,
+    shown: bool,
+) -> None:
+    """Takes messages into `rates` until the deadline or the end of the graph; `shown`: in a table that is renewed."""
+    from rich.live import Live
+
+    from dataflow.client.attach import still_runs
+
+    due = 0.0
+    with Live(console=out, auto_refresh=False, transient=True) if shown else nullcontext() as live:
+        while deadline is None or time.monotonic() < deadline:
+            taken = client.take(timeout=0.25)
+            if taken is not None:
+                _take_rate(rates, taken)
+            elif not still_runs(found):
+                return
+            if window is not None:
+                for rate in rates.values():
+                    rate.forget_before(time.monotonic() - window)
+            if live is not None and time.monotonic() >= due:
+                due = time.monotonic() + 0.25
+                live.update(_rate_table(rates, found.namespace), refresh=True)
 
 
 def _take_rate(rates: dict[str, _Rate], taken: TapMessage) -> None:

@@ -23,21 +23,23 @@ LEVELS = ("debug", "info", "warning", "error", "fatal")
 LOOK_EVERY = 0.1
 _STYLES = {"debug": "dim", "info": "", "warning": "yellow", "error": "red", "fatal": "bold red"}
 
+_Operators = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--operator",
+        metavar="NAME",
+        autocompletion=running_operators,
+        help="Only this operator or process. May be repeated.",
+    ),
+]
+
 
 def logs(
     recording: Annotated[
         Path | None,
         typer.Argument(metavar="[RECORDING|RUN]", help="A recording (.mcap), or the name of a running graph."),
     ] = None,
-    operators: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--operator",
-            metavar="NAME",
-            autocompletion=running_operators,
-            help="Only this operator or process. May be repeated.",
-        ),
-    ] = None,
+    operators: _Operators = None,
     level: Annotated[
         str, typer.Option("--level", metavar="LEVEL", help="Only this level and worse: " + ", ".join(LEVELS) + ".")
     ] = "debug",
@@ -74,12 +76,9 @@ def logs(
             if graph is not None:
                 raise fail(f"{recording} and --graph {graph} both name a running graph; leave one out")
             name, recording = str(recording), None
-        if recording is not None:
-            if follow or graph is not None or wait:
-                raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
-            lines = _recorded(existing_recording(recording))
-        else:
-            lines = _running(name, wait, follow=follow)
+        if recording is not None and (follow or graph is not None or wait):
+            raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
+        lines = _running(name, wait, follow=follow) if recording is None else _recorded(existing_recording(recording))
         wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
         shown = 0
         try:
@@ -89,10 +88,14 @@ def logs(
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
     if not shown and not json:
-        some = " that was asked for" if operators or level != "debug" else ""
-        say(f"[dim]nothing was logged or printed{some}[/]")
-        if recording is not None and operators:
-            _tell_unknown(recording, operators)
+        _report_nothing(recording, operators, level)
+
+
+def _report_nothing(recording: Path | None, operators: list[str] | None, level: str) -> None:
+    some = " that was asked for" if operators or level != "debug" else ""
+    say(f"[dim]nothing was logged or printed{some}[/]")
+    if recording is not None and operators:
+        _report_unknown(recording, operators)
 
 
 def _recorded(path: Path) -> Iterator[LogLine]:
@@ -109,8 +112,8 @@ def _recorded(path: Path) -> Iterator[LogLine]:
         yield line
 
 
-def _tell_unknown(path: Path, names: list[str]) -> None:
-    """Says which of the names are those of no operator or process of a recording, and what is near."""
+def _report_unknown(path: Path, names: list[str]) -> None:
+    """Prints which of the names are those of no operator or process of a recording, and what is near."""
     from dataflow.graph.problems import did_you_mean
     from dataflow.recording import Recording
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +33,7 @@ from dataflow.cli.support.storage import MODES, Readable, SplitEvery, SplitSize,
 
 if TYPE_CHECKING:
     from dataflow.client.recorder import Tally
+    from dataflow.graph import Graph
     from dataflow.transport.registry import RunningGraph
 
 
@@ -75,7 +77,6 @@ def record(
     from dataflow.client.attach import graph_of
     from dataflow.client.recorder import AttachedRecorder, subscribed
     from dataflow.client.recorder import record as write
-    from dataflow.reexecution.recorded_run import graph_metadata
 
     with friendly_errors():
         splitting = splitting_of(split_every, split_size)
@@ -87,24 +88,21 @@ def record(
             say_followed(found)
         running = graph_of(found)
         chosen = chosen_streams(streams, running.streams, running.namespace)
-        about = {"mode": "recorded from outside", "started": str(time.time_ns())}
-        metadata = {**graph_metadata(running), "dataflow:run": about}
+        made = partial(AttachedRecorder, splitting=splitting, compression=compression, mode=MODES[readable])
         with (
             subscribed(found, chosen) as subscription,
-            AttachedRecorder(
-                output,
-                running,
-                chosen,
-                metadata=metadata,
-                splitting=splitting,
-                compression=compression,
-                overwrite=overwrite,
-                mode=MODES[readable],
-            ) as recorder,
+            made(output, running, chosen, metadata=_metadata(running), overwrite=overwrite) as recorder,
             _shown(recorder.tally, quiet or json) as show,
         ):
             write(subscription, recorder, goes_on=_until_over(found, duration, show))
         _report(recorder.tally, json=json)
+
+
+def _metadata(running: Graph) -> dict[str, dict[str, str]]:
+    from dataflow.reexecution.recorded_run import graph_metadata
+
+    about = {"mode": "recorded from outside", "started": str(time.time_ns())}
+    return {**graph_metadata(running), "dataflow:run": about}
 
 
 def _until_over(found: RunningGraph, duration: float | None, show: Callable[[], None]) -> Iterator[bool]:

@@ -15,7 +15,7 @@ from dataflow.cli.support.arguments import FLAG
 from dataflow.cli.support.output import INTERRUPTED, err, fail, friendly_errors, out, print_json
 
 if TYPE_CHECKING:
-    from dataflow.cli.support.board import Sample
+    from dataflow.cli.support.status_table import Sample
     from dataflow.client.processes import Processes
     from dataflow.transport.registry import RunningGraph
 
@@ -80,15 +80,15 @@ def _samples(
     found: RunningGraph, processes: Processes, first: float, every: float, *, latencies: bool = True
 ) -> Iterator[Sample]:
     """Samples of a running graph, after `first` seconds, then every so many, until it ends; one at least."""
-    from dataflow.cli.support.board import Board
+    from dataflow.cli.support.status_table import StatusTable
     from dataflow.client.attach import graph_of, still_runs
 
-    board = Board(graph_of(found))
-    several = any(node.machine is not None for node in board.graph.nodes.values())
-    board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+    table = StatusTable(graph_of(found))
+    several = any(node.machine is not None for node in table.graph.nodes.values())
+    table.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
     time.sleep(first)
     while True:
-        sample = board.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
+        sample = table.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
         yield replace(sample, machines=processes.machines(ANSWER_WITHIN)) if several else sample
         if not still_runs(found):
             return
@@ -96,7 +96,7 @@ def _samples(
 
 
 def _print_one(found: RunningGraph, processes: Processes, every: float, *, json: bool) -> None:
-    from dataflow.cli.support.board import as_json, shown
+    from dataflow.cli.support.status_table import as_json, shown
 
     sample = next(_samples(found, processes, every, every))
     if json:
@@ -109,7 +109,7 @@ def _follow(found: RunningGraph, processes: Processes, every: float) -> None:
     """Shows one table, which changes; the last one stays."""
     from rich.live import Live
 
-    from dataflow.cli.support.board import shown
+    from dataflow.cli.support.status_table import shown
 
     last: Any = None
     with Live(console=out, auto_refresh=False, transient=True) as live:
@@ -122,7 +122,7 @@ def _follow(found: RunningGraph, processes: Processes, every: float) -> None:
 
 def _print_lines(found: RunningGraph, processes: Processes, every: float) -> None:
     """Prints a heading once, then a line for each operator at every update; a note when a source falls behind."""
-    from dataflow.cli.support.board import heading, line
+    from dataflow.cli.support.status_table import heading, line
 
     printed: Sequence[str] = ()
     behind: Mapping[str, str] = {}

@@ -60,7 +60,7 @@ def as_doubles(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def bits_survive(data: npt.NDArray[Any], wider: npt.NDArray[Any]) -> bool:
-    """Tells whether `wider` cast back has the bits of `data`."""
+    """Returns whether `wider` cast back has the bits of `data`."""
     return wider.astype(data.dtype).tobytes() == data.tobytes()
 
 

@@ -100,7 +100,7 @@ class Heartbeats(Watcher):
         self._end_hang(process, operator, f"missed the deadline of {operator!r}: {what}")
 
     def _look_for_hang(self, messages: int, nbytes: int) -> None:
-        """Sources drop because so much waits for operators that no source waits for: one of those may hang."""
+        """Where the backlog is full and sources drop, checks whether an operator hangs."""
         lags = {name: self._cover.lags(process, name)[1] for process, name in self._cover.counted()}
         for process in self.run.processes.values():
             if process.work is None or process.life is not Life.RUNNING:

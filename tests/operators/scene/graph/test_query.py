@@ -10,12 +10,16 @@ import pytest
 from made_towers import write_row
 from typer.testing import CliRunner
 
+from dataflow.graph import load_graph
 from dataflow.messages import FeatureVector, SceneGraph
 from dataflow.recording import RecordingWriter
+from dataflow.reexecution.recorded_run import graph_metadata
+from operators.labels import LabelSpace, labels_file
 from operators.scene.commands import scene
 from operators.scene.graph.query import _MEANT, _PHRASES, Clause, QueryError, as_json, ask, parse
 from operators.scene.graph.spark import as_spark_dsg
 
+GRAPHS = Path(__file__).resolve().parents[4] / "graphs"
 NAMES = ("mug", "table", "person", "floor", "room")
 NODES = ((-2, 4), (0, 3), (1, 1), (2, 0), (3, 0), (4, 2), (5, 1))
 RELATIONS = ((2, "on", 1, 0.9), (3, "on", 0, 0.8), (2, "near", 4, 0.7), (1, "left_of", 5, 0.6), (4, "holding", 3, 0.4))
@@ -98,6 +102,47 @@ def test_what_is_not_understood_is_named(question: str, words: str) -> None:
         ask(graph(), question)
 
 
+COCO = LabelSpace.read(Path(labels_file("coco")))
+
+
+@pytest.mark.parametrize(
+    ("question", "ids"),
+    [
+        ("cup on dining table", [2, 3]),
+        ("mug on table", [2, 3]),  # on a table top, too, of a table that may be unseen
+        ("mug on desk 1", [2]),
+        ("mug not on table", []),
+        ("cup on tabletop", [3]),
+        ("cup on tabletop 1", [3]),
+        ("table supports mug", [1]),
+        ("desk", [1]),
+        ("human near screen", [4]),
+        ("anything near TV monitor", [4]),
+    ],
+)
+def test_other_names_of_classes_are_those_of_the_label_space(question: str, ids: list[int]) -> None:
+    """Cup 2 is on table 1, cup 3 on a table top; person 4 is near a television."""
+    made = graph().replace(
+        class_names=("cup", "dining table", "person", "tabletop", "room", "tv"),
+        ids=np.array([-2, -11, 1, 2, 3, 4, 5]),
+        class_ids=np.array([4, 3, 1, 0, 0, 2, 5], np.int32),
+        labels=("room", "tabletop 1", "dining table 1", "cup 2", "cup 3", "person 4", "tv 5"),
+        predicates=("on", "on", "near"),
+        subjects=np.array([3, 4, 5], np.int32),
+        objects=np.array([2, 1, 6], np.int32),
+        relation_scores=np.array([0.9, 0.8, 0.7], np.float32),
+    )
+    assert sorted(int(made.ids[m.node]) for m in ask(made, question, COCO)) == ids
+    with pytest.raises(QueryError, match="'sofa' is no class of this graph"):
+        ask(made, "cup on sofa", COCO)
+
+
+def test_a_class_of_the_very_name_comes_before_one_that_is_called_so_too() -> None:
+    made = graph().replace(class_names=("cup", "table", "person", "mug", "desk"))
+    assert [int(made.ids[m.node]) for m in ask(made, "desk", COCO)] == [-2]
+    assert sorted(int(made.ids[m.node]) for m in ask(made, "dining table", COCO)) == [-2, 1, 5]
+
+
 def test_what_is_proposed_is_a_relation_and_no_relation_is_called_something_else() -> None:
     assert set(_MEANT.values()) <= set(_PHRASES)
     assert not set(_MEANT) & set(_PHRASES)
@@ -138,6 +183,25 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
     nodes = asked(str(recording), "--nodes")[1]
     assert "holding" in nodes
     assert "12, 31" in nodes
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_command_knows_the_label_space_of_the_graph_that_was_recorded(tmp_path: Path, there: bool) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("label_space: own\nunit: m\nlabels:\n  mug: {aliases: [teacup]}\n")
+    made = load_graph(GRAPHS / "perception_rgbd.yaml", settings=[f"labels={own}"])
+    (stream,) = (name for name in made.streams if name.endswith("scene/graph"))
+    with RecordingWriter(tmp_path / "room.mcap", metadata=graph_metadata(made)) as writer:
+        writer.add_stream(stream, SceneGraph)
+        writer.write(stream, graph(), seq=0)
+    if not there:
+        own.unlink()
+    code, out = asked(str(tmp_path / "room.mcap"), "--query", "teacup on table")
+    if there:
+        assert (code, out[:5]) == (0, "mug 2")
+    else:
+        assert code == 2
+        assert "label space cannot be read" in " ".join(out.split())
 
 
 def test_a_time_after_the_last_graph_is_said(recording: Path) -> None:

@@ -72,7 +72,7 @@ class Fit:
         return max(0.0, 1.0 - self.fast / max(_TOLERATED * self.slow, 1e-6))
 
 
-class MonteCarlo(Remembered):
+class ParticleFilter(Remembered):
     """A cloud of poses (N, 3) with logarithms of their weights, and how well each sensor fits it."""
 
     poses: Array

@@ -74,7 +74,7 @@ class Sample:
 
 
 @dataclass(slots=True)
-class Board:
+class StatusTable:
     """Turns what processes answer into samples; an operator whose process does not answer keeps its last counts."""
 
     graph: Graph

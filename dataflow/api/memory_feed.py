@@ -14,7 +14,7 @@ from dataflow.records.firing import Emission
 from dataflow.sync import NEVER, Entry
 
 
-class HandedFeed:
+class MemoryFeed:
     """The streams of a graph's sources, one step after the other; what it gives is recorded as a source's would be."""
 
     def __init__(self, graph: Graph, static: Mapping[str, Message], emitter: Emitter) -> None:

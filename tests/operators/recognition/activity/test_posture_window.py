@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operators.recognition.activity.recognizer import Looks
+from operators.recognition.activity.recognizer import PostureWindow
 
 
 def probabilities(*values: float) -> np.ndarray:
@@ -15,7 +15,7 @@ def probabilities(*values: float) -> np.ndarray:
 
 
 def test_looks_count_for_half_a_second() -> None:
-    looks = Looks()
+    looks = PostureWindow()
     assert looks.evidence(1.0) is None
     looks.update(1.0, probabilities(0.8, 0.2))
     looks.update(1.5, None)
@@ -25,7 +25,7 @@ def test_looks_count_for_half_a_second() -> None:
 
 
 def test_two_looks_that_contradict_each_other_say_nothing() -> None:
-    looks = Looks()
+    looks = PostureWindow()
     looks.update(0.0, probabilities(0.9, 0.1))
     looks.update(0.25, probabilities(0.1, 0.9))
     found = looks.evidence(1.0)
@@ -38,7 +38,7 @@ def test_two_looks_that_contradict_each_other_say_nothing() -> None:
     weight=st.floats(0, 3),
 )
 def test_the_likeliest_has_one_and_none_has_nothing(looks: list[list[float]], weight: float) -> None:
-    taken = Looks()
+    taken = PostureWindow()
     for k, look in enumerate(looks):
         taken.update(0.1 * k, probabilities(*look))
     found = taken.evidence(weight)
@@ -50,7 +50,7 @@ def test_the_likeliest_has_one_and_none_has_nothing(looks: list[list[float]], we
 
 
 def test_looks_go_on_after_a_snapshot() -> None:
-    first, second = Looks(), Looks()
+    first, second = PostureWindow(), PostureWindow()
     first.update(0.0, probabilities(0.7, 0.3))
     second.restore(first.snapshot())
     for each in (first, second):

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from dataflow.cli.commands.following.health import silent
-from dataflow.cli.support.board import Board, Sample, heading, line, machine_line, shown
+from dataflow.cli.support.status_table import Sample, StatusTable, heading, line, machine_line, shown
 from dataflow.client.processes import MachineStatus, ProcessStatus
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
@@ -32,7 +32,7 @@ Counts = tuple[int, int, int, int, int, int]
 
 
 def graph_with(*names: str) -> Graph:
-    """A graph of operators with these names, of which a board needs no more."""
+    """A graph of operators with these names, of which a table needs no more."""
     graph = load_text(GRAPH)
     return replace(graph, nodes={name: replace(graph.nodes["left"], name=name) for name in names})
 
@@ -51,11 +51,11 @@ def status(
 
 
 def test_the_board_follows_operators_from_answer_to_answer() -> None:
-    board = Board(graph_with("camera", "detector", "planner"))
-    board.update(
+    table = StatusTable(graph_with("camera", "detector", "planner"))
+    table.update(
         [status("eyes", camera=(10, 10, 0, 0, 10**9, 0)), status("brain", detector=(0, 0, 0, 0, NEVER, 0))], 1.0
     )
-    sample = board.update(
+    sample = table.update(
         [
             status("eyes", camera=(40, 40, 0, 0, 4 * 10**9, 0)),
             status("brain", detector=(5, 5, 6, 10**9, 2 * 10**9, 15 * 10**8)),
@@ -71,22 +71,22 @@ def test_the_board_follows_operators_from_answer_to_answer() -> None:
 
 
 def test_the_board_keeps_the_last_counts_of_a_process_that_is_away_and_takes_up_its_successor() -> None:
-    board = Board(graph_with("camera"))
-    board.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
+    table = StatusTable(graph_with("camera"))
+    table.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
 
-    (away,) = board.update([], 2.0).rows
+    (away,) = table.update([], 2.0).rows
     assert (away.state, away.firings, away.dropped, away.rate) == ("no answer", 10, 2, 0.0)
-    (back,) = board.update([status("eyes", restarts=1, camera=(1, 1, 0, 0, 2 * 10**9, 0))], 3.0).rows
+    (back,) = table.update([status("eyes", restarts=1, camera=(1, 1, 0, 0, 2 * 10**9, 0))], 3.0).rows
     assert (back.state, back.restarts, back.rate) == ("running", 1, 1.0)
-    (over,) = board.update([status("eyes", restarts=1, ended=True, camera=(5, 5, 0, 0, 2 * 10**9, 0))], 4.0).rows
+    (over,) = table.update([status("eyes", restarts=1, ended=True, camera=(5, 5, 0, 0, 2 * 10**9, 0))], 4.0).rows
     assert over.state == "ended"
 
 
 def test_timeouts_and_late_messages_are_no_drops() -> None:
-    board = Board(graph_with("fusion"))
-    board.update([status("brain", fusion=(10, 10, 0, 0, 10**9, 0))], 1.0)
+    table = StatusTable(graph_with("fusion"))
+    table.update([status("brain", fusion=(10, 10, 0, 0, 10**9, 0))], 1.0)
     waits = {"fusion": {("image", "timeout"): 3, ("image", "late"): 2, ("cloud", "late"): 1}}
-    sample = board.update([status("brain", fusion=(20, 20, 0, 0, 2 * 10**9, 0), waits=waits)], 2.0)
+    sample = table.update([status("brain", fusion=(20, 20, 0, 0, 2 * 10**9, 0), waits=waits)], 2.0)
 
     (fusion,) = sample.rows
     assert (fusion.state, fusion.dropped, fusion.timeouts, fusion.late) == ("timeout", 0, 3, 3)
@@ -111,11 +111,11 @@ def test_timeouts_and_late_messages_are_no_drops() -> None:
 def test_a_source_behind_the_clock_is_named_with_who_holds_it_up(
     read: float, sent: float, cpu: float, told: str
 ) -> None:
-    board = Board(graph_with("camera", "detector"))
-    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
+    table = StatusTable(graph_with("camera", "detector"))
+    table.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
     counts = {"camera": (20, 20, 0, round(cpu * 1e9), 2 * 10**9, 10**9), "detector": (9, 9, 0, 0, 2 * 10**9, 0)}
 
-    sample = board.update([status("all", behind={"camera": (read, sent)}, **counts)], 2.0)
+    sample = table.update([status("all", behind={"camera": (read, sent)}, **counts)], 2.0)
 
     note = sample.behind["camera"]
     assert note.startswith(f"source 'camera' is 15.1 s behind the clock: {told}")
@@ -134,11 +134,11 @@ def printed(sample: Sample, width: int) -> list[str]:
 
 def test_the_table_fits_a_terminal_of_80_columns() -> None:
     names = ["robot", "front_camera/depth_decoder", "trajectory_score", "detector"]
-    board = Board(graph_with(*names))
+    table = StatusTable(graph_with(*names))
     counts = dict.fromkeys(names, (12345678, 1, 1234567, 10**9, 10**18, 10**9))
-    board.update([ProcessStatus("perception_process", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
+    table.update([ProcessStatus("perception_process", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
     more = {name: (12345999, 1, 1239999, 10**10, 10**18 - 10**9 * k, 10**10) for k, name in enumerate(names)}
-    sample = board.update([ProcessStatus("perception_process", more, dict.fromkeys(names, 12), frozenset())], 2.0)
+    sample = table.update([ProcessStatus("perception_process", more, dict.fromkeys(names, 12), frozenset())], 2.0)
 
     lines = printed(sample, 80)
 
@@ -150,9 +150,9 @@ def test_the_table_fits_a_terminal_of_80_columns() -> None:
 
 
 def test_lines_stand_under_their_heading() -> None:
-    board = Board(graph_with("camera", "detector"))
-    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
-    sample = board.update(
+    table = StatusTable(graph_with("camera", "detector"))
+    table.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
+    sample = table.update(
         [status("all", camera=(20, 20, 1234, 10**8, 2 * 10**9, 0), detector=(9, 9, 0, 0, 10**9, 0))], 2.0
     )
 
@@ -165,10 +165,10 @@ def test_lines_stand_under_their_heading() -> None:
 
 
 def test_what_an_operator_found_wrong_is_among_the_notes() -> None:
-    board = Board(graph_with("camera", "check"))
+    table = StatusTable(graph_with("camera", "check"))
     found = {"check": "edges of colour and depth did not fit"}
     counts = dict.fromkeys(("camera", "check"), (1, 1, 0, 0, 10**9, 0))
-    sample = board.update([ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), found=found)], 1.0)
+    sample = table.update([ProcessStatus("eyes", counts, dict.fromkeys(counts, 0), frozenset(), found=found)], 1.0)
     assert "check: edges of colour and depth did not fit" in "\n".join(printed(sample, 80))
 
 
