@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.operator import Remembered
+from operators.odometry.lidar.beams import Beams
 
 Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
@@ -76,7 +77,7 @@ class Pairs:
     """Points and the planes in whose voxels they lie.
 
     `points` (M,) are indices; `centers` and `normals` (M, 3) in the map's frame; `thickness` (M,) is the variance of
-    the plane's points about it, m²; `slopes` (M,) that of the normal's direction, rad²; `births` (M,) is when the voxel
+    the plane's points about it, m²; `slopes` (M,) that of the normal's direction, rad²; `births` (M,) is when the plane
     was first seen, as `add` was told; `known` is the share of all points in voxels that hold enough points to tell.
     """
 
@@ -122,8 +123,11 @@ class _Rows(Remembered):
         self.births[rows] = birth
         return rows
 
-    def take(self, moments: Array, rows: Rows, centers: Array) -> None:
-        """Adds moments (V, 10) about `centers` (V, 3) to rows that have not enough points, and fits their planes."""
+    def take(self, moments: Array, rows: Rows, centers: Array, beams: Beams | None, birth: int) -> None:
+        """Adds moments (V, 10) about `centers` (V, 3) to rows that have not enough points, and fits their planes.
+
+        A plane is as old as the first of its fits that was one.
+        """
         wanting = np.flatnonzero(self.moments[rows, 0] < ENOUGH)
         rows, moments = rows[wanting], self.moments[rows[wanting]] + moments[wanting]
         self.moments[rows] = moments
@@ -141,7 +145,13 @@ class _Rows(Remembered):
         planes[:, 3:6] = normals
         planes[:, 6] = thin
         planes[:, 7] = (thin + _NOISE**2) / (moments[:, 0] * np.maximum(narrow, 1e-9))
-        planes[:, 8] = (thin < (FLAT * self.size + 0.01) ** 2) & (narrow > (WIDE * self.size) ** 2)
+        thickest = FLAT * self.size + 0.01
+        planes[:, 8] = (thin < thickest**2) & (narrow > (WIDE * self.size) ** 2)
+        new = np.flatnonzero((planes[:, 8] > 0) & (self.planes[rows, 8] == 0))
+        if beams is not None:
+            passed = beams.pass_through(planes[new, :3], planes[new, 3:6], spread[new], thickest)
+            planes[new[passed], 8] = 0
+        self.births[rows[new]] = birth
         self.planes[rows] = planes
         self.fitted[rows] = moments[:, 0]
 
@@ -178,10 +188,14 @@ class PlaneMap(Remembered):
     def __len__(self) -> int:
         return sum(rows.count for rows in self._rows)
 
-    def add(self, points: Array, birth: int) -> None:
-        """Takes points (N, 3) in the map's frame; voxels that they open are marked with `birth`."""
+    def add(self, points: Array, birth: int, seen_from: Array | None = None) -> None:
+        """Takes points (N, 3) in the map's frame; voxels and planes that they open are marked with `birth`.
+
+        No beam passes through a plane that is `seen_from` a place (3,).
+        """
         if not len(points):
             return
+        beams = None if seen_from is None else Beams(points, seen_from)
         cell = _cells(points, self._size / 2 ** (self._levels - 1))
         code = _spread_bits(cell[0]) << 2 | _spread_bits(cell[1]) << 1 | _spread_bits(cell[2])
         order = np.argsort(code, kind="stable")
@@ -201,7 +215,7 @@ class PlaneMap(Remembered):
             new = np.flatnonzero(rows < 0)
             rows[new] = self._rows[k].grow(len(new), birth)
             self._tables[k][block_of[new], inside[new]] = rows[new]
-            self._rows[k].take(moments, rows, self._corners[block_of])
+            self._rows[k].take(moments, rows, self._corners[block_of], beams, birth)
             code = code >> 3
 
     def pairs(self, points: Array) -> Pairs:
