@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,31 @@ def test_a_bare_corridor_tells_nothing_of_the_way_along_it_and_the_covariance_sa
     off = errors(played, along)[-1]
     assert abs(off[0]) < 3 * deviation[0]
     assert np.abs(off[1:3]).max() < 0.03
+
+
+def test_an_epoch_of_the_map_begins_where_the_pose_moved_or_became_much_less_certain() -> None:
+    """What is seen first then is as unsure as the pose, what was seen before stays as it was."""
+    operator = LidarOdometry()
+    operator.setup()
+    for k in range(3):
+        operator.process(scan(ROOM, lambda _: np.eye(4), k))
+    grown = operator.state.tracker
+    motion, epochs = grown._motion, grown._epochs
+    assert motion is not None
+    seen, last = len(epochs), epochs[-1]
+    much, little = tracker._UNSURER * last + 1.1 * tracker._SURE, tracker._UNSURER * last + 0.9 * tracker._SURE
+    away = np.asarray(motion.T @ se3.exp(np.array([1.1, 0, 0, 0, 0, 0])))
+    steps = ((motion.T, little, False), (motion.T, much, True), (motion.T, much, False), (away, much, True))
+    rng, old = np.random.default_rng(1), np.column_stack([np.full(9, 5.0), np.linspace(-2, 3, 9), np.full(9, 1.0)])
+    for k, (T, covariance, begins) in enumerate(steps):
+        wall = np.column_stack([rng.normal(12.5 + 4 * k, 0.005, 400), rng.uniform(-1.9, 1.9, (400, 2))])
+        grown._motion = replace(motion, T=T, covariance=covariance)
+        grown._grow((wall - T[:3, 3]) @ T[:3, :3])
+        seen += begins
+        assert len(epochs) == seen
+        assert set(grown._map.pairs(wall).births.tolist()) == {seen - 1}
+    assert (epochs[-1] == much).all()
+    assert set(grown._map.pairs(old).births.tolist()) == {0}
 
 
 def test_a_robot_that_nods_on_a_field_is_not_carried_away_by_it() -> None:
