@@ -225,7 +225,8 @@ class LidarTracker(Remembered):
         """Returns why a fit is not to be believed, or nothing; more is asked of one that may be `far` away."""
         assert self._motion is not None
         config = self._config
-        min_known = max(config.min_known, 0.5) if lost else config.min_known
+        unsearched = lost or (self._motion.fresh and self._missed > 0)  # it may be beyond all that was searched
+        min_known = max(config.min_known, 0.5) if unsearched else config.min_known
         min_inliers = max(config.min_inliers, 0.7) if far else config.min_inliers
         if found.known < min_known:
             return f"{found.known:.0%} of the scan lie in mapped places"

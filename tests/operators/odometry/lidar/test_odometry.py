@@ -18,6 +18,7 @@ from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.odometry import LidarOdometry
 from operators.odometry.lidar import tracker
+from operators.odometry.lidar.fit import Fit
 from operators.odometry.lidar.map import PlaneMap, thinned
 from operators.odometry.lidar.odometry import Sweep
 from operators.odometry.lidar.search import around
@@ -212,6 +213,20 @@ def test_an_epoch_of_the_map_begins_where_the_pose_moved_or_became_much_less_cer
         assert set(grown._map.pairs(wall).births.tolist()) == {seen - 1}
     assert (epochs[-1] == much).all()
     assert set(grown._map.pairs(old).births.tolist()) == {0}
+
+
+def test_a_pose_after_a_first_step_that_was_missed_is_believed_only_where_half_of_the_scan_is_mapped() -> None:
+    """The velocity is not known, so the sensor may be beyond all that was searched."""
+    operator = LidarOdometry()
+    operator.setup()
+    operator.process(scan(ROOM, circling, 0))
+    begun = operator.state.tracker
+    some = np.zeros((0, 6)), 400, 0.9, 0.4, 0.01, np.zeros(400, np.int64), np.ones(400)
+    found = Fit(np.eye(4), np.eye(6), *some)
+    assert begun._doubt(found, 7 * STEP, lost=False, far=True) == ""
+    begun._missed = 1
+    assert begun._doubt(found, 7 * STEP, lost=False, far=True) == "40% of the scan lie in mapped places"
+    assert begun._doubt(replace(found, known=0.6), 7 * STEP, lost=False, far=True) == ""
 
 
 def test_a_robot_that_nods_on_a_field_is_not_carried_away_by_it() -> None:
