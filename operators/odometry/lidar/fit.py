@@ -131,12 +131,12 @@ def _equations(points: Array, planes: PlaneMap, T: Matrix, width: float, noise: 
     R = T[:3, :3]
     world = points @ R.T + T[:3, 3]
     pairs = planes.pairs(world)
-    off = world[pairs.points] - pairs.centers
+    off = world.take(pairs.points, axis=0) - pairs.centers
     deviation = np.sqrt(noise**2 + pairs.thickness + pairs.slopes * np.einsum("ij,ij->i", off, off))
     residuals = np.einsum("ij,ij->i", off, pairs.normals) / deviation
     weights = geman_mcclure(np.square(residuals / width))
     normals = pairs.normals @ R
-    own = points[pairs.points]
+    own = points.take(pairs.points, axis=0)
     J = np.empty((len(own), 6))
     J[:, :3] = normals
     J[:, 3] = own[:, 1] * normals[:, 2] - own[:, 2] * normals[:, 1]

@@ -51,8 +51,8 @@ def prepare(
     if spacing is None:
         median = float(np.sqrt(np.median(square[kept]))) if len(kept) else 0.0
         spacing = float(np.clip(median / SPACINGS, _CLOSEST, _WIDEST))
-    chosen = kept[thinned(points[kept], spacing)]
-    usable = points[chosen].astype(np.float64)
+    chosen = kept[thinned(points.take(kept, axis=0), spacing)]
+    usable = points.take(chosen, axis=0).astype(np.float64)
     times = None if offsets is None else offsets[chosen].astype(np.float64)
     sample = thinned(usable, SPARSER * spacing)
     sample = sample[:: -(-len(sample) // MOST)] if len(sample) else sample

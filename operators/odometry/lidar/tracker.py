@@ -22,6 +22,8 @@ from operators.odometry.lidar.search import ANY_TURN, apart, around, places
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
+_UNSURER = 2.25  # times the variance of the last epoch: a new one begins, however little the sensor moved,
+_SURE = np.diag([0.01**2] * 3 + [1e-3**2] * 3)  # and that much more
 _REACH = 3.0  # metres to each side that a search for the pose covers
 _BASIN = 0.5  # metres: nearer to the truth a fit needs no search
 _LOST_REACH, _FARTHEST = 6.0, 20.0  # metres that a search for a lost sensor covers at most, and for a velocity: time
@@ -144,7 +146,7 @@ class LidarTracker(Remembered):
         self._motion = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
         self._first = scan
         self._epochs = [np.zeros((6, 6))]
-        self._map.add(scan.points, 0)
+        self._map.add(scan.points, 0, np.zeros(3))
         return self._result(State.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
 
     def _anew(self, scan: Scan, stamp: int) -> Tracked:
@@ -155,7 +157,7 @@ class LidarTracker(Remembered):
         self._motion, self._missed = LidarMotion(stamp, T, np.zeros(6), as_left(covariance, T)), 0
         self._map = PlaneMap(self._config.voxel, self._config.levels)
         self._first, self._epochs, self._epoch_T = scan, [self._motion.covariance], T
-        self._map.add(scan.points @ T[:3, :3].T + T[:3, 3], 0)
+        self._map.add(scan.points @ T[:3, :3].T + T[:3, 3], 0, T[:3, 3])
         reason = f"nothing was measured for {gone:.1f} s: a new map begins here"
         return self._result(State.LOST, reason, scan, self._motion, covariance)
 
@@ -216,14 +218,15 @@ class LidarTracker(Remembered):
         found, *others = self._fitted(replace(scan, offsets=None), stamp, starts)
         points = deskewed(first.points, first.offsets, motion.velocity_to(found.T, stamp))
         self._map = PlaneMap(self._config.voxel, self._config.levels)
-        self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0)
+        self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], 0, motion.T[:3, 3])
         return [*self._fitted(scan, stamp, [found.T]), *others]
 
     def _doubt(self, found: Fit, stamp: int, lost: bool, far: bool) -> str:
         """Returns why a fit is not to be believed, or nothing; more is asked of one that may be `far` away."""
         assert self._motion is not None
         config = self._config
-        min_known = max(config.min_known, 0.5) if lost else config.min_known
+        unsearched = lost or (self._motion.fresh and self._missed > 0)  # it may be beyond all that was searched
+        min_known = max(config.min_known, 0.5) if unsearched else config.min_known
         min_inliers = max(config.min_inliers, 0.7) if far else config.min_inliers
         if found.known < min_known:
             return f"{found.known:.0%} of the scan lie in mapped places"
@@ -270,10 +273,12 @@ class LidarTracker(Remembered):
         motion = self._motion
         assert motion is not None
         moved = se3.log(invert(self._epoch_T) @ motion.T)
-        if np.linalg.norm(moved[:3]) > _EPOCH[0] or np.linalg.norm(moved[3:]) > _EPOCH[1]:
+        unsurer = np.linalg.eigvalsh(motion.covariance - _UNSURER * self._epochs[-1] - _SURE)[-1] > 0
+        if unsurer or np.linalg.norm(moved[:3]) > _EPOCH[0] or np.linalg.norm(moved[3:]) > _EPOCH[1]:
             self._epochs.append(motion.covariance)
             self._epoch_T = motion.T
-        self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], len(self._epochs) - 1)
+        origin = motion.T[:3, 3]
+        self._map.add(points @ motion.T[:3, :3].T + origin, len(self._epochs) - 1, origin)
         if np.linalg.norm(motion.T[:3, 3] - self._pruned_at) > 0.1 * self._config.far:
             self._pruned_at = motion.T[:3, 3].copy()
             self._map.keep(self._pruned_at, 1.2 * self._config.far)

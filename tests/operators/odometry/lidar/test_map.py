@@ -121,6 +121,31 @@ def test_two_walls_in_one_large_voxel_are_planes_of_smaller_ones() -> None:
     np.testing.assert_allclose(np.abs(pairs.normals), [[0, 0, 1], [1, 0, 0]], atol=0.02)
 
 
+def test_scan_lines_that_cross_are_no_surface_where_beams_pass_between_them() -> None:
+    rng = np.random.default_rng(6)
+    column = np.column_stack([np.full(12, 8.4), np.full(12, 1.9), np.linspace(0.1, 1.9, 12)])
+    ceiling = np.column_stack([np.full(12, 8.4), np.linspace(0.1, 1.9, 12), np.full(12, 1.9)])
+    lines = np.concatenate([column, ceiling]) + rng.normal(0, 0.005, (24, 3))
+    beyond = np.column_stack([np.full(400, 15.0), rng.uniform(-1, 2, 400), rng.uniform(-1, 4, 400)])
+    seen, unknown = PlaneMap(2.0, 1), PlaneMap(2.0, 1)
+    seen.add(np.concatenate([lines, beyond]), 0, np.array([0.0, 0.5, 1.0]))
+    unknown.add(np.concatenate([lines, beyond]), 0)
+    assert len(unknown.pairs(lines).points) == len(lines)
+    assert not len(seen.pairs(lines).points)
+    wall = np.column_stack([np.full(600, 8.4), rng.uniform(0.05, 1.95, (600, 2))]) + rng.normal(0, 0.005, (600, 3))
+    seen = PlaneMap(2.0, 1)
+    seen.add(np.concatenate([wall, beyond[np.abs(beyond[:, 1]) > 2]]), 0, np.array([0.0, 0.5, 1.0]))
+    assert len(seen.pairs(wall).points) > 0.99 * len(wall)
+
+
+def test_a_plane_is_as_old_as_its_first_fit_not_as_its_voxel() -> None:
+    planes, rng = PlaneMap(2.0, 1), np.random.default_rng(7)
+    planes.add(rng.uniform(0.1, 1.9, (3, 3)) * [1, 1, 0] + [0, 0, 1], birth=0)
+    flat = np.column_stack([rng.uniform(0.1, 1.9, (60, 2)), rng.normal(1.0, 0.002, 60)])
+    planes.add(flat, birth=4)
+    assert set(planes.pairs(flat).births.tolist()) == {4}
+
+
 def test_a_map_keeps_what_is_near_and_forgets_the_rest() -> None:
     planes, far = PlaneMap(2.0, 2), slope(4000, reach=3.0) + AWAY
     planes.add(np.concatenate([slope(4000, reach=3.0), far]), birth=3)
