@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,7 @@ from typing import Any
 import numpy as np
 
 PERIOD, OUTAGE = 12.0, 3.0
+_DIGITS = re.compile(r"\d+(\.\d+)?")
 
 
 def fed(operator: Any, samples: Sequence[Any], others: Sequence[Any]) -> Iterator[Any]:
@@ -265,7 +267,10 @@ def wheels_of(
 
 
 def faultless(seed: int, seconds: int) -> tuple[list[str], list[float], list[float]]:
-    """Returns the warnings of a drive without faults, and NEES/3 of the position and its deviation (m) every 10 s."""
+    """Returns the warnings of a drive without faults, and NEES/3 of the position and its deviation (m) every 10 s.
+
+    A warning whose figures change is one, as in the viewer's log.
+    """
     from dataflow.messages.diagnostics import Level
     from operators.fusion import EkfFusion
     from operators.fusion.sensors.settings import SensorSettings
@@ -279,13 +284,13 @@ def faultless(seed: int, seconds: int) -> tuple[list[str], list[float], list[flo
     operator = EkfFusion(heading=heading, heading_sigma=0.05, rest=0.5, patience=0.5, sensors=sensors)
     operator.setup()
     mounted = SimpleNamespace(process=lambda messages, context: operator.process(messages, context, extrinsics))
-    warnings, nees, claimed, standing = list[str](), list[float](), list[float](), set[str]()
+    warnings, nees, claimed, standing = list[str](), list[float](), list[float](), set[tuple[str, str]]()
     for given in fired(mounted, samples, others):
         if (status := given["status"]) is not None:
             rows = zip(status.names, status.levels, status.messages, strict=True)
-            now = {f"{name}: {text}" for name, level, text in rows if level == Level.WARN}
-            warnings += [f"{status.stamp * 1e-9:.1f} s {text}" for text in sorted(now - standing)]
-            standing = now
+            now = {(name, _DIGITS.sub("", text)): text for name, level, text in rows if level == Level.WARN}
+            warnings += [f"{status.stamp * 1e-9:.1f} s {key[0]}: {now[key]}" for key in sorted(now.keys() - standing)]
+            standing = set(now)
         pose = given["odometry"]
         if pose is not None and pose.stamp > 10**10 and pose.stamp % 10**10 == 0:
             off, C = truth[pose.stamp][:3, 3] - pose.position, pose.pose_covariance[:3, :3]

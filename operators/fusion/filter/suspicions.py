@@ -35,10 +35,13 @@ from operators.fusion.filter.window import Step, Window, places
 
 Array = NDArray[np.float64]
 CHANCE = 6e-5
-"""Probability of evidence as strong where nothing is wrong, that of four standard deviations: a drive of an hour has
-180 windows."""
+"""Probability of evidence as strong in a window where nothing is wrong, that of four standard deviations."""
+_RARE = 6e-7
+"""The same of five, for a window that slides: it passes u standard deviations by chance about u² times as often as
+windows side by side (Pickands, "Upcrossing probabilities for stationary Gaussian processes", 1969), four of them once
+in six hours, five once in 400."""
 _CEASES = 0.25
-"""Share of that evidence at which an error that was found no longer counts, and from which one is looked for at all."""
+"""Share of the first evidence at which an error that was found no longer counts, and one is looked for at all."""
 _EVERY = 1_000_000_000
 """Nanoseconds from one look to the next."""
 _FEWEST = 5
@@ -119,13 +122,14 @@ class Suspicions(Remembered):
             self._suspected, self._fits, self._found = suspected, [], None
         if not fits:
             return None
-        enough = float(quantile(1 - CHANCE, len(suspected)))
+        ceases = _CEASES * float(quantile(1 - CHANCE, len(suspected)))
         without = self._fitted(window, False)
-        if self._found is None and without.promise < _CEASES * enough:  # a second fit is not worth its time
+        if self._found is None and without.promise < ceases:  # a second fit is not worth its time
             self._fits = [without]
             return without if without.explains else None
         self._fits = [without, self._fitted(window, True)]
-        self._found = self._judged(without, self._fits[1], enough * (_CEASES if self._found else 1.0))
+        begins = float(quantile(1 - (_RARE if window.first else CHANCE), len(suspected)))
+        self._found = self._judged(without, self._fits[1], ceases if self._found else begins)
         if self._found is not None and self._found[1] == SCALE:
             return None
         fit = self._fits[self._found is not None]

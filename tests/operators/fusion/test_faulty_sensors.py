@@ -13,6 +13,7 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.operator import Context
 from dataflow.state import StateError, plain
 from operators.fusion import EkfFusion
+from operators.fusion.alarms import Alarms
 
 RATE, GRAVITY = 100, 9.80665
 Array = np.ndarray
@@ -220,7 +221,9 @@ def test_positions_that_repeat_while_the_robot_drives_on_are_frozen_and_used_aga
 
 def test_a_sensor_none_of_whose_messages_is_of_use_is_named_with_the_reason() -> None:
     drive = Drive(2.0)
-    zeros = [(at, name, m.replace(covariance=np.zeros((6, 6)))) for at, name, m in drive.fixes() if isinstance(m, Pose)]
+    zeros: list[Event] = [
+        (at, name, m.replace(covariance=np.zeros((6, 6)))) for at, name, m in drive.fixes() if isinstance(m, Pose)
+    ]
     first, text = Run(drive, zeros).alarms["robot/fix"][0]
     assert first < 1.0
     assert text == "of no use: covariance not positive"
@@ -313,6 +316,38 @@ def test_a_drive_without_faults_raises_no_alarm(wheels: bool) -> None:
     assert not Run(drive, *streams).alarms
 
 
+@pytest.mark.parametrize(
+    ("wheels", "axes", "warns"), [(True, [2, 1, 0], True), (True, [0, 1, 2], False), (False, [2, 1, 0], False)]
+)
+def test_a_base_on_wheels_that_lies_on_its_side_by_gravity_is_warned_of_at_once(
+    wheels: bool, axes: list[int], warns: bool
+) -> None:
+    """What does not roll may lie as it likes."""
+    drive = Drive(1.0)
+    sensors = {"robot/wheels": {"use": "wheels", "sigma": 0.03}} if wheels else {}
+    operator = EkfFusion(patience=0.5, heading=drive.heading, sensors=sensors)
+    operator.setup()
+    statuses = list[tuple[float, bool]]()
+    for now, _, imu in drive.imu:
+        assert isinstance(imu, Imu)
+        imu = imu.replace(
+            angular_velocity=imu.angular_velocity[axes], linear_acceleration=imu.linear_acceleration[axes]
+        )
+        made = operator.process({"ns/robot/imu": imu}, Context(now)) or {}
+        if (status := made.get("status")) is not None:
+            rows = dict(zip(status.names, status.levels, strict=True))
+            statuses.append(((now - 10**9) * 1e-9, rows.get("level") == Level.WARN))
+    assert statuses[0][0] < 0.6
+    assert statuses[0][1] == warns
+
+
+def test_an_alarm_whose_figures_change_is_no_new_one() -> None:
+    alarms = Alarms()
+    for after, text, due in ((0, "0.34 s late", True), (1, "0.32 s late", False), (2, None, False), (3, "0.2 s", True)):
+        others = {} if text is None else {"fix": text}
+        assert (alarms.due(after * 10**8, {}, {}, {}, others) is not None) == due
+
+
 @pytest.mark.long
 def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
     drive = Drive(8.0)
@@ -320,7 +355,7 @@ def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
     one = Run(drive, [e for e in fixes if e[0] < stamp_of(7.0)]).operator
     other = EkfFusion(patience=0.5, heading=drive.heading, sensors=one.sensors)
     other.setup()
-    other.restore(one.snapshot())
+    other.restore(one.snapshot() or {})
     assert one.state.filter is not None
     assert other.state.filter is not None
     assert other.state.filter.health["robot/fix"].leap

@@ -186,3 +186,26 @@ def test_a_filter_older_than_the_window_begins_anew_by_stronger_evidence(old: bo
     fused._suspicions = SimpleNamespace(look=lambda *_: fit, found=None)  # type: ignore[assignment]
     fused.look()
     assert (fused.restarted == 4 * 10**8) == restarts
+
+
+@pytest.mark.parametrize(("old", "sigmas", "named"), [(False, 4.2, True), (True, 4.2, False), (True, 5.2, True)])
+def test_a_window_that_slides_asks_for_five_standard_deviations(old: bool, sigmas: float, named: bool) -> None:
+    """A window passes four by chance in the hours in which it slides, and what begins wrong is to be found soon."""
+    window, made = Drive(seconds=26 if old else 14).window(), Suspicions(SensorErrors(), DOWN, (0.02, 0.2))
+    assert bool(window.first) == old
+    ones = State(ZERO, ZERO, np.eye(3), ZERO, ZERO, np.eye(SIZE))
+
+    def fitted(gain: float) -> None:
+        size = np.array([0.07 * gain**0.5])
+        fits = {
+            erring: Fit(0, ones, size, 200 - gain * erring, size * 0 + 0.07, 200, promise=gain) for erring in (0, 1)
+        }
+        made._fitted = lambda window, erring: fits[erring]  # type: ignore[method-assign]
+        made.look(made._looked + 10**10, window)
+
+    fitted(sigmas**2)
+    assert (made.found is not None) == named
+    fitted(2.1**2)  # what was found is kept until half of four
+    assert (made.found is not None) == named
+    fitted(1.9**2)
+    assert made.found is None
