@@ -9,7 +9,7 @@ from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odomet
 from dataflow.messages.geometry import invert
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
-from operators.geometry.depth_sensors import DEPTH_SENSOR, read_depth_sensor
+from operators.geometry.depth_sensors import DEPTH_SENSOR, DepthSensor, read_depth_sensor
 from operators.geometry.extrinsics import transform_between
 from operators.odometry.emission import outputs
 from operators.odometry.rgbd.camera import RgbdCamera
@@ -88,11 +88,11 @@ class VisualOdometry(Operator):
     state: State
     _tracker: RgbdOdometry | None = None
     _calibration: Calibration | None = None
+    _sensor: DepthSensor | None = None
 
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a depth sensor that is not known."""
-        sensor = read_depth_sensor(self.depth_sensor, self.use_file)
-        self._noise = DepthNoise.of(sensor, self.depth_noise_floor, self.depth_noise_quadratic)
+        self._sensor = read_depth_sensor(self.depth_sensor, self.use_file)
 
     def initial_state(self) -> State:
         return State(odometry=RgbdState(LocalMap(self.keyframes)))
@@ -131,7 +131,7 @@ class VisualOdometry(Operator):
         return RgbdOdometryConfig(
             near=self.near,
             far=self.far,
-            depth_noise=self._noise,
+            depth_noise=DepthNoise.of(self._sensor, self.depth_noise_floor, self.depth_noise_quadratic),
             corners=self.corners,
             min_inliers=self.min_inliers,
             refine=self.refine,

@@ -23,7 +23,7 @@ from dataflow.messages.geometry import transform_points
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import Voxels
 from operators.geometry.calibration import check_calibration
-from operators.geometry.depth_sensors import DEPTH_SENSOR, read_depth_sensor
+from operators.geometry.depth_sensors import DEPTH_SENSOR, DepthSensor, read_depth_sensor
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
 from operators.odometry.rgbd.odometry import Calibration, camera_of, same
@@ -122,11 +122,11 @@ class VisualSlam(Operator):
     state: State
     _slam: RgbdSlam | None = None
     _calibration: Calibration | None = None
+    _sensor: DepthSensor | None = None
 
     def setup(self) -> None:
         """Raises FileNotFoundError or ValueError for a saved map that is none, or a depth sensor that is not known."""
-        sensor = read_depth_sensor(self.depth_sensor, self.use_file)
-        self._noise = DepthNoise.of(sensor, self.depth_noise_floor, self.depth_noise_quadratic)
+        self._sensor = read_depth_sensor(self.depth_sensor, self.use_file)
         self._known = None if self.map_file is None else read_visual_map(FilePath(self.use_file(self.map_file)))
 
     def initial_state(self) -> State:
@@ -207,7 +207,8 @@ class VisualSlam(Operator):
         return self._slam
 
     def _config(self) -> RgbdOdometryConfig:
-        return RgbdOdometryConfig(near=self.near, far=self.far, depth_noise=self._noise)
+        noise = DepthNoise.of(self._sensor, self.depth_noise_floor, self.depth_noise_quadratic)
+        return RgbdOdometryConfig(near=self.near, far=self.far, depth_noise=noise)
 
     def _settings(self) -> GraphSettings:
         return GraphSettings(
