@@ -2,6 +2,7 @@
 
     python benchmarks/covariances.py            RGB-D and stereo, forwards, backwards, and parts begun anew
     python benchmarks/covariances.py rgbd       RGB-D alone (or stereo)
+    python benchmarks/covariances.py rgbd --depth-sensor kinect_v1      with its noise, not the usual figures
     python benchmarks/covariances.py truth      where depth alone contradicts the truth of 7-Scenes
 
 Poses and covariances as emitted, relative to the first frame of a part.
@@ -12,7 +13,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +32,10 @@ from scipy.stats import chi2  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry import se3  # noqa: E402
+from operators.geometry.depth_sensors import read_depth_sensor  # noqa: E402
 from operators.odometry.rgbd.odometry import camera_of  # noqa: E402
+from operators.odometry.rgbd.settings import RgbdOdometryConfig  # noqa: E402
+from operators.odometry.rgbd.surface import DepthNoise  # noqa: E402
 from operators.odometry.rgbd.tracker import RgbdOdometry  # noqa: E402
 from operators.odometry.stereo.odometry import rig_of  # noqa: E402
 from operators.odometry.stereo.tracker import StereoOdometry  # noqa: E402
@@ -43,18 +49,18 @@ EXACT, JITTER = np.zeros(6), np.array([2e-3] * 3 + [2e-3] * 3)  # metres and rad
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Holds the two images of each frame, stamps in nanoseconds, true poses (None where unknown), and the class of the
-    odometry with the camera it is made for."""
+    """Holds the two images of each frame, stamps in nanoseconds, true poses (None where unknown), what makes the
+    odometry, and the camera it is made for."""
 
     seen: list[tuple[Any, Any]]
     stamps: list[int]
     truth: list[Matrix | None]
-    method: type[RgbdOdometry] | type[StereoOdometry]
+    method: Callable[[Any], RgbdOdometry | StereoOdometry]
     camera: Any
 
 
-def rgbd(folder: Path) -> Frames:
-    """Reads a folder in the layout of 7-Scenes or TUM."""
+def rgbd(folder: Path, sensor: str = "") -> Frames:
+    """Reads a folder in the layout of 7-Scenes or TUM, of a depth sensor by its name."""
     source = RgbdFolder(path=str(folder))
     source.setup()
     static: dict[str, Any] = dict(source.static_outputs())
@@ -62,7 +68,9 @@ def rgbd(folder: Path) -> Frames:
     steps: list[Any] = list(source.stream())
     truth = [step["ground_truth"].matrix() if "ground_truth" in step else None for step in steps]
     seen = [(step["image"].data, step["depth"].data) for step in steps]
-    return Frames(seen, [step["image"].stamp for step in steps], truth, RgbdOdometry, camera)
+    config = RgbdOdometryConfig(depth_noise=DepthNoise.of(read_depth_sensor(sensor)))
+    method = partial(RgbdOdometry, config=config)
+    return Frames(seen, [step["image"].stamp for step in steps], truth, method, camera)
 
 
 def stereo(folder: Path) -> Frames:
@@ -172,11 +180,11 @@ def _registered(frames: Frames, i: int, j: int, T_guess: Matrix) -> Matrix:
     return np.asarray(fit.T_target_source)
 
 
-def rgbd_tables(data: Path) -> None:
-    seven, folder = rgbd(data / "rgbd_7scenes"), data / "scenes" / "fr1_rpy"
+def rgbd_tables(data: Path, sensor: str) -> None:
+    seven, folder = rgbd(data / "rgbd_7scenes", sensor), data / "scenes" / "fr1_rpy"
     parts = [*both_ways("0-249", 0, 249), *both_ways("0-120", 0, 120), *both_ways("160-249", 160, 249)]
     table("7-Scenes", seven, parts, [("as it is", seven.truth, EXACT), ("errs by 2 mm, 2 mrad", seven.truth, JITTER)])
-    rpy = rgbd(folder)
+    rpy = rgbd(folder, sensor)
     parts = [*both_ways("0-274", 0, 274), *both_ways("0-136", 0, 136), *both_ways("137-274", 137, 274)]
     earlier = later(rpy, folder, -0.02).truth
     table("fr1_rpy", rpy, parts, [("as it is", rpy.truth, EXACT), ("20 ms earlier", earlier, EXACT)])
@@ -193,6 +201,7 @@ def main() -> None:
     parser.add_argument("what", choices=["rgbd", "stereo", "all", "truth"], nargs="?", default="all")
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data")
     parser.add_argument("--data", type=Path, default=data, help="folder of shared data")
+    parser.add_argument("--depth-sensor", default="", help="of RGB-D: kinect_v1 ... (default: usual figures)")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     if arguments.what == "truth":
@@ -207,7 +216,7 @@ def main() -> None:
     print("| drive | truth | frames | NEES/6, median | of its quarters | above 95 % bound, % |")
     print("| --- | --- | ---: | ---: | --- | ---: |")
     if arguments.what != "stereo":
-        rgbd_tables(arguments.data)
+        rgbd_tables(arguments.data, arguments.depth_sensor)
     if arguments.what != "rgbd":
         stereo_tables(arguments.data)
 

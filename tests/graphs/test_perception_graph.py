@@ -82,6 +82,12 @@ def test_a_correction_of_the_extrinsics_does_not_reach_the_trackers_which_refuse
     assert {"perception/cloud", "perception/lifter"} <= corrected
 
 
+def test_a_depth_sensor_reaches_odometry_slam_and_map() -> None:
+    graph = load_graph(REPOSITORY / "graphs" / "perception_rgbd.yaml", settings=["depth_sensor=kinect_v1", "slam=true"])
+    for name in ("odometry", "slam", "objects"):
+        assert graph.nodes[f"perception/{name}"].params["depth_sensor"] == "kinect_v1"
+
+
 @pytest.mark.parametrize(("adapt", "source"), [(False, "image_watch/checked"), (True, "adapter/adapted")])
 def test_the_networks_see_adapted_images_where_that_is_asked_for(adapt: bool, source: str) -> None:
     graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=[f"perception.adapt={adapt}"])

@@ -9,6 +9,7 @@ from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odomet
 from dataflow.messages.geometry import invert
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
+from operators.geometry.depth_sensors import DEPTH_SENSOR, DepthSensor, read_depth_sensor
 from operators.geometry.extrinsics import transform_between
 from operators.odometry.emission import outputs
 from operators.odometry.rgbd.camera import RgbdCamera
@@ -67,8 +68,13 @@ class VisualOdometry(Operator):
     odometry_frame: str = Param("odom", min_length=1, doc="name of the frame that the first depth camera defines")
     near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
     far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
-    depth_noise_floor: float = Param(0.002, gt=0, doc="standard deviation of a near depth", unit="m")
-    depth_noise_quadratic: float = Param(0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m")
+    depth_sensor: str = Param("", doc=DEPTH_SENSOR)
+    depth_noise_floor: float | None = Param(
+        None, gt=0, doc="standard deviation of a near depth; none is the sensor's, 0.002 without one", unit="m"
+    )
+    depth_noise_quadratic: float | None = Param(
+        None, ge=0, doc="and what it grows by per depth squared; none is the sensor's, 0.002 without one", unit="1/m"
+    )
     corners: int = Param(300, ge=30, doc="most corners tracked from a keyframe")
     min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
     refine: bool = Param(True, doc="refine with the depth image; off leaves the features alone")
@@ -82,6 +88,11 @@ class VisualOdometry(Operator):
     state: State
     _tracker: RgbdOdometry | None = None
     _calibration: Calibration | None = None
+    _sensor: DepthSensor | None = None
+
+    def setup(self) -> None:
+        """Raises FileNotFoundError or ValueError for a depth sensor that is not known."""
+        self._sensor = read_depth_sensor(self.depth_sensor, self.use_file)
 
     def initial_state(self) -> State:
         return State(odometry=RgbdState(LocalMap(self.keyframes)))
@@ -120,7 +131,7 @@ class VisualOdometry(Operator):
         return RgbdOdometryConfig(
             near=self.near,
             far=self.far,
-            depth_noise=DepthNoise(self.depth_noise_floor, self.depth_noise_quadratic),
+            depth_noise=DepthNoise.of(self._sensor, self.depth_noise_floor, self.depth_noise_quadratic),
             corners=self.corners,
             min_inliers=self.min_inliers,
             refine=self.refine,

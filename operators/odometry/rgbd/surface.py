@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.geometry.depth_sensors import DepthSensor
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
 
@@ -23,6 +24,12 @@ class DepthNoise:
 
     floor: float = 0.002
     quadratic: float = 0.002
+
+    @classmethod
+    def of(cls, sensor: DepthSensor | None, floor: float | None = None, quadratic: float | None = None) -> "DepthNoise":
+        """Returns the noise of a sensor, the usual one without; what is given beside it has precedence."""
+        usual = cls() if sensor is None else cls(sensor.floor, sensor.quadratic)
+        return cls(usual.floor if floor is None else floor, usual.quadratic if quadratic is None else quadratic)
 
     def sigma(self, z: NDArray[np.floating]) -> NDArray[np.floating]:
         return self.floor + self.quadratic * z * z

@@ -27,6 +27,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
+from operators.geometry.depth_sensors import DEPTH_SENSOR, read_depth_sensor
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
 from operators.scene.known_classes import warn_of_unknown
@@ -131,6 +132,7 @@ class SemanticMap(Operator):
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
     surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
     max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
+    depth_sensor: str = Param("", doc=f"{DEPTH_SENSOR}; what it grows by with the range counts")
     map_file: str | None = Param(None, doc="saved map to begin with; an empty one if none")
     save: str | None = Param(None, doc="file that the map is written to at the end")
     learned: list[str] = Param(
@@ -140,7 +142,8 @@ class SemanticMap(Operator):
     state: State
 
     def setup(self) -> None:
-        """Raises FileNotFoundError or ValueError for a bad label space or map, or a map with voxels of another size."""
+        """Raises FileNotFoundError or ValueError for a bad label space, sensor or map, or voxels of another size."""
+        self._sensor = read_depth_sensor(self.depth_sensor, self.use_file)
         self._labels = LabelSpace.read(self.use_file(labels_file(self.labels)))
         self._known = None if self.map_file is None else SavedMap.read(FilePath(self.use_file(self.map_file)))
         if self._known is not None and self._known.voxel != self.voxel:
@@ -291,6 +294,7 @@ class SemanticMap(Operator):
             confirm=self.confirm,
             views=self.views,
             missed=self.missed,
+            range_noise=MapSettings.range_noise if self._sensor is None else self._sensor.quadratic,
             mover_memory=self.mover_memory,
             move_memory=self.move_memory,
         )

@@ -23,6 +23,7 @@ from dataflow.messages.geometry import transform_points
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import Voxels
 from operators.geometry.calibration import check_calibration
+from operators.geometry.depth_sensors import DEPTH_SENSOR, DepthSensor, read_depth_sensor
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
 from operators.odometry.rgbd.odometry import Calibration, camera_of, same
@@ -102,8 +103,13 @@ class VisualSlam(Operator):
     save: str | None = Param(None, doc="file that the map is written to at the end")
     near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
     far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
-    depth_noise_floor: float = Param(0.002, gt=0, doc="standard deviation of a near depth", unit="m")
-    depth_noise_quadratic: float = Param(0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m")
+    depth_sensor: str = Param("", doc=DEPTH_SENSOR)
+    depth_noise_floor: float | None = Param(
+        None, gt=0, doc="standard deviation of a near depth; none is the sensor's, 0.002 without one", unit="m"
+    )
+    depth_noise_quadratic: float | None = Param(
+        None, ge=0, doc="and what it grows by per depth squared; none is the sensor's, 0.002 without one", unit="1/m"
+    )
     spacing: float = Param(0.2, gt=0, doc="change of view between keyframes: angle + baseline / depth", unit="rad")
     travel: float = Param(1.5, gt=0, doc="change of view along the way that a loop closes", unit="rad")
     candidates: int = Param(2, ge=1, doc="views compared with, of those nearby and of those that look alike")
@@ -116,9 +122,11 @@ class VisualSlam(Operator):
     state: State
     _slam: RgbdSlam | None = None
     _calibration: Calibration | None = None
+    _sensor: DepthSensor | None = None
 
     def setup(self) -> None:
-        """Raises FileNotFoundError or ValueError for a saved map that is none."""
+        """Raises FileNotFoundError or ValueError for a saved map that is none, or a depth sensor that is not known."""
+        self._sensor = read_depth_sensor(self.depth_sensor, self.use_file)
         self._known = None if self.map_file is None else read_visual_map(FilePath(self.use_file(self.map_file)))
 
     def initial_state(self) -> State:
@@ -199,7 +207,7 @@ class VisualSlam(Operator):
         return self._slam
 
     def _config(self) -> RgbdOdometryConfig:
-        noise = DepthNoise(self.depth_noise_floor, self.depth_noise_quadratic)
+        noise = DepthNoise.of(self._sensor, self.depth_noise_floor, self.depth_noise_quadratic)
         return RgbdOdometryConfig(near=self.near, far=self.far, depth_noise=noise)
 
     def _settings(self) -> GraphSettings:
