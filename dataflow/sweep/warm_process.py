@@ -54,7 +54,6 @@ COMMANDS = {
 
 def command(words: Sequence[str]) -> int:
     """Calls a command of this package; it ends in `SystemExit`."""
-    end_with_parent()
     sys.argv = ["dataflow", *words]
     importlib.import_module("dataflow.cli.start").main()
     return 0
@@ -64,7 +63,6 @@ def fetch(words: Sequence[str]) -> int:
     """Fetches a URL that fsspec opens into a file; returns the exit code."""
     import fsspec  # of the extra `remote`
 
-    end_with_parent()
     url, file = words
     store, path = fsspec.core.url_to_fs(url)
     store.get_file(path, file)
@@ -72,6 +70,12 @@ def fetch(words: Sequence[str]) -> int:
 
 
 CALLS = {"command": command, "fetch": fetch}
+
+
+def make(call: str, words: Sequence[str], warm: int) -> int:
+    """Makes a call in a fork of the process `warm`, with which it ends."""
+    end_with_parent(parent=warm)
+    return CALLS[call](words)
 
 
 def serve(connection: socket.socket) -> None:
@@ -96,7 +100,7 @@ def serve(connection: socket.socket) -> None:
             loaded.add(use)
             become_warm()
         out, err = given
-        pid = fork(partial(CALLS[call], words), (), os.environ, (out, err))
+        pid = fork(partial(make, call, words, os.getpid()), (), os.environ, (out, err))
         for descriptor in given:
             os.close(descriptor)
         handle = os.pidfd_open(pid)

@@ -64,7 +64,7 @@ def start(arguments: Sequence[str], ports: Sequence[int], *, outlive: bool) -> s
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=None if outlive else partial(end_with_parent, signal.SIGTERM),
+        preexec_fn=None if outlive else partial(end_with_parent, signal.SIGTERM, os.getpid()),
     )
     deadline = time.monotonic() + _START_TIMEOUT
     while not all(listening(port) for port in ports):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event, Thread
@@ -23,6 +25,17 @@ STORE = """
 import time
 class core:
     url_to_fs = staticmethod(lambda url: time.sleep(120))
+"""
+LATE = """
+import os
+import time
+from dataflow.parent import end_with_parent
+parent = os.getpid()
+if os.fork() == 0:
+    while os.getppid() == parent:
+        time.sleep(0.001)
+    end_with_parent(parent=parent)
+    print("goes on")
 """
 
 
@@ -107,3 +120,8 @@ def test_a_killed_process_is_told_and_the_next_call_made(
         stop.set()
         thread.join(30)
     assert worker.call("command", ["--version"], (), output, 60) == 0
+
+
+def test_a_process_whose_parent_has_ended_before_it_asks_ends_at_once() -> None:
+    ran = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, timeout=30, check=True)
+    assert ran.stdout == ""
