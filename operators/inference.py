@@ -76,9 +76,7 @@ def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.In
         session = onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # onnxruntime's exception classes share no public base
         raise ModelError(f"{told} cannot be loaded as an ONNX model: {error}") from error
-    if (
-        _PROVIDERS[provider.partition(":")[0]] not in session.get_providers()
-    ):  # it only logs this, and takes the next one
+    if _PROVIDERS[provider.partition(":")[0]] not in session.get_providers():  # it only logs this, and takes another
         raise ModelError(
             f"onnxruntime's provider {provider!r} could not start: is there such a device, and are its driver and "
             f"libraries installed? On this machine provider: cpu runs {told}"

@@ -10,7 +10,7 @@ from dataflow.sync import FOREVER
 
 
 class Turns:
-    """Whose record is next, by the wall time at which its call began."""
+    """Keeps whose record is next, by the wall time at which its call began."""
 
     def __init__(self) -> None:
         self._next: dict[RunnerInTurn, int] = {}
@@ -28,7 +28,7 @@ class Turns:
 
 
 class RunnerInTurn(RecordedRunner):
-    """Waits for its turn before each call."""
+    """Repeats an operator's recorded calls, each when its turn has come."""
 
     def __init__(self, *given: Any, turns: Turns, **options: Any) -> None:
         super().__init__(*given, **options)
