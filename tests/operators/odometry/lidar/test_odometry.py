@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_beams import CORRIDOR, beams, cast
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry, PointCloud, Transforms
@@ -30,32 +31,6 @@ ROOM = [  # axis, place, and what the rectangle spans of the other two axes
     (2, -0.6, (-4, 5), (-3, 4)), (2, 2.0, (-4, 5), (-3, 4)), (0, -4, (-3, 4), (-1, 2)), (0, 5, (-3, 4), (-1, 2)),
     (1, -3, (-4, 5), (-1, 2)), (1, 4, (-4, 5), (-1, 2)), (0, 2.5, (1.5, 4), (-1, 1.2)), (1, -1.8, (0, 1.5), (-1, 0.9)),
 ]  # fmt: skip
-CORRIDOR = [
-    (2, -0.6, (-60, 60), (-1, 1)), (2, 2.0, (-60, 60), (-1, 1)), (1, -1, (-60, 60), (-1, 2)), (1, 1, (-60, 60), (-1, 2))
-]  # fmt: skip
-
-
-def beams(rings: int = 24, columns: int = 240) -> Array:
-    """Directions (N, 3), column after column, as a LiDAR turns."""
-    azimuth, elevation = np.meshgrid(np.arange(columns) * 2 * np.pi / columns, np.linspace(-0.4, 0.4, rings),
-                                     indexing="ij")  # fmt: skip
-    a, e = azimuth.ravel(), elevation.ravel()
-    return np.column_stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
-
-
-def cast(world: list[Any], origins: Array, directions: Array, limit: float = 30.0) -> Array:
-    """Distance (N,) of the first rectangle on each ray; infinite where there is none within the limit."""
-    nearest = np.full(len(origins), np.inf)
-    for axis, place, *spans in world:
-        others = [k for k in range(3) if k != axis]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (place - origins[:, axis]) / directions[:, axis]
-            hit = origins + t[:, None] * directions
-        inside = (t > 1e-6) & (t < limit)
-        for k, (low, high) in zip(others, spans, strict=True):
-            inside &= (hit[:, k] >= low) & (hit[:, k] <= high)
-        nearest = np.where(inside & (t < nearest), t, nearest)
-    return nearest
 
 
 def scan(
