@@ -33,3 +33,22 @@ def test_what_fits_does_not_leap_nor_what_another_device_says_nor_what_comes_lat
     assert leapt("wheels standstill", "Velocity", 0.9, LEAPT, residual=0.01) == 0.0
     assert leapt("camera", "Velocity", 0.9, LEAPT) == 0.0
     assert leapt("wheels no turn", "AngularRate", 1.5, LEAPT) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "seconds", "place", "size"),
+    [
+        ("FullPose", 0.5, 0.62, 0.0),
+        ("Position", 0.5, 0.62, 0.6),  # of the same kind: no witness
+        ("FullPose", 3.0, 0.62, 0.6),  # too long ago
+        ("FullPose", 0.5, 4.0, 0.6),  # elsewhere
+    ],
+)
+def test_leap_to_a_place_that_another_kind_of_sensor_gives_as_well_is_none(
+    kind: str, seconds: float, place: float, size: float
+) -> None:
+    there = Doubt(10**9, np.array([place, 0.0, 0.0]), NOISE, kind)
+    others = {"camera": Health(last_used=10**8, doubts=(there,), streak=3)}
+    own = Doubt(10**9, np.array([0.6, 0.0, 0.0]), NOISE, "Position")
+    health = {"gps": Health(last_used=10**9, doubts=(own,), streak=1, leap=0.6), **others}
+    assert leapt("gps", "Position", seconds, health) == pytest.approx(size)

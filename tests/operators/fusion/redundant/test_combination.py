@@ -15,6 +15,7 @@ from operators.fusion.redundant.combination import (
     Unknown,
     contradicts,
     place_consistency,
+    place_misfits,
     placed,
     pose_misfits,
     posed,
@@ -124,3 +125,11 @@ def test_a_contradiction_is_found_as_often_as_chance_makes_one() -> None:
     assert 8 <= alarms <= 34
     seen[1] = Place(seen[1].position + 2.0, seen[1].covariance)
     assert contradicts(place_consistency(seen), 0.999)
+
+
+def test_misfit_of_a_place_is_its_distance_from_the_others() -> None:
+    at = [np.zeros(3), np.array([0.0, 0.1, 0.0]), np.array([2.0, 0.0, 0.0])]
+    misfits = place_misfits([Place(place, np.eye(3) * 0.01) for place in at])
+    off = np.array([2.0, -0.05, 0.0])
+    assert misfits[2] == pytest.approx(off @ off / 0.015 / 3)
+    assert misfits[2] > 3 * misfits[:2].max() and np.isnan(place_misfits([Bearing(at[0], at[2] / 2, 0.01)])).all()

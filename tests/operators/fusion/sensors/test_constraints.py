@@ -13,6 +13,7 @@ from dataflow.operator import Context
 from operators.fusion import EkfFusion
 from operators.fusion.filter.error_state import Noise
 from operators.fusion.filter.history import Sample
+from operators.fusion.filter.measurements import Velocity
 from operators.fusion.sensors.constraints import Constraints
 
 RATE, GRAVITY = 100, 9.80665
@@ -122,6 +123,19 @@ def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
     operator, held = outage(velocity, 0 * t, 12.0, yaw, slip=0.02)
     assert held < 0.5 * without
     assert count(operator, "slip, used") > 150
+
+
+def test_slip_is_bounded_ten_times_a_second_beside_what_rolls() -> None:
+    at = np.eye(4)
+    at[:3, :3], at[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0.2, 0.3]  # the base looks along the body's y
+    constraints = Constraints(None, 0.02)
+    level, noise = np.array([0.0, 0.0, GRAVITY]), Noise(1e-3, 1e-3, 0.0, 0.0)
+    made = [list(constraints.after(Sample(k * 10**7, np.zeros(3), level, noise), at)) for k in range(21)]
+    assert [k for k, found in enumerate(made) if found] == [0, 10, 20]
+    ((name, model, covariance),) = made[0]
+    assert name == "slip" and np.allclose(covariance, np.eye(2) * 4e-4)
+    assert isinstance(model, Velocity) and np.allclose(model.value, 0) and np.allclose(model.lever, [0.1, 0.2, 0.3])
+    assert np.allclose(model.axes, [[-1, 0, 0], [0, 0, 1]])
 
 
 @pytest.mark.long
