@@ -28,4 +28,5 @@ DOUBT = Doubt(NOW, np.ones(3), np.eye(3), "Position")
 def test_row_of_a_sensor_names_its_state(health: Health, warnings: dict[str, str], text: str, level: Level) -> None:
     status = diagnostics(NOW, {"gps": health}, {}, {}, warnings)
     row = list(status.names).index("gps")
-    assert status.messages[row] == text and status.levels[row] == level
+    assert status.messages[row] == text
+    assert status.levels[row] == level

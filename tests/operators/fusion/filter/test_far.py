@@ -15,4 +15,5 @@ def test_room_for_a_place_is_bounded_and_other_rows_are_not(metres: float, kept:
     H[:3, POSITION], H[3, VELOCITY] = np.eye(3), [1.0, 0.0, 0.0]
     residual = np.array([0.6 * metres, 0.0, 0.8 * metres, 2000.0])
     shortened, beyond = bounded(residual, H)
-    assert np.allclose(shortened, [0.6 * kept, 0.0, 0.8 * kept, 2000.0]) and beyond is far
+    assert np.allclose(shortened, [0.6 * kept, 0.0, 0.8 * kept, 2000.0])
+    assert beyond is far

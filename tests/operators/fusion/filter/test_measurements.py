@@ -18,5 +18,6 @@ def test_residual_of_a_place_may_be_of_the_position_or_of_the_velocity_since(
 ) -> None:
     residual = np.array([3.0])
     room = model.widening(residual, seconds)
-    assert np.allclose(room[POSITION], 9.0) and np.allclose(room[VELOCITY], 9.0 / over**2)
+    assert np.allclose(room[POSITION], 9.0)
+    assert np.allclose(room[VELOCITY], 9.0 / over**2)
     assert not room[ROTATION].any()

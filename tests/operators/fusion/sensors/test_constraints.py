@@ -133,8 +133,11 @@ def test_slip_is_bounded_ten_times_a_second_beside_what_rolls() -> None:
     made = [list(constraints.after(Sample(k * 10**7, np.zeros(3), level, noise), at)) for k in range(21)]
     assert [k for k, found in enumerate(made) if found] == [0, 10, 20]
     ((name, model, covariance),) = made[0]
-    assert name == "slip" and np.allclose(covariance, np.eye(2) * 4e-4)
-    assert isinstance(model, Velocity) and np.allclose(model.value, 0) and np.allclose(model.lever, [0.1, 0.2, 0.3])
+    assert name == "slip"
+    assert np.allclose(covariance, np.eye(2) * 4e-4)
+    assert isinstance(model, Velocity)
+    assert np.allclose(model.value, 0)
+    assert np.allclose(model.lever, [0.1, 0.2, 0.3])
     assert np.allclose(model.axes, [[-1, 0, 0], [0, 0, 1]])
 
 
