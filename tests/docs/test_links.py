@@ -20,7 +20,7 @@ from dataflow.graph import load_text
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = sorted(
-    [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "benchmarks").glob("*.md")]
+    [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "benchmarks").rglob("*.md")]
 )
 PROGRAM = typer.main.get_command(app)
 
