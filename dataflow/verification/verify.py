@@ -341,10 +341,7 @@ def _report(
             if stream in answer["digests"]
         },
         outputs={name: tuple(nodes[name].outputs.values()) for name in task.operators},
-        producers={
-            name: frozenset(task.graph.streams[s].node for taken in nodes[name].inputs.values() for s in taken)
-            for name in task.operators
-        },
+        producers={name: frozenset(task.graph.streams[s].node for s in nodes[name].taken) for name in task.operators},
         start=start,
         torn=task.torn,
         part=task.ledger.part,
@@ -389,19 +386,9 @@ def _answer_of_each(answers: Sequence[Mapping[str, Any]]) -> Mapping[str, Mappin
 
 def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
     """The books of a stand-in, with what reading its messages has shown."""
-    made = StandIn.of(
-        name,
-        task.ledger.accounts[name],
-        ended=task.ledger.ended,
-        torn=task.ledger.torn,
-        part=task.ledger.part is not None,
-    )
-    read = [s for s in stored if s.maker == name]
-    return replace(
-        made,
-        unaccounted=max(made.unaccounted, sum(s.uncalled for s in read)),
-        missing=max(made.missing, sum(s.missing for s in read)),
-    )
+    made, read = StandIn.of(name, task.ledger), [s for s in stored if s.maker == name]
+    unaccounted = max(made.unaccounted, sum(s.uncalled for s in read))
+    return replace(made, unaccounted=unaccounted, missing=max(made.missing, sum(s.missing for s in read)))
 
 
 def _retry(task: _Task, culprits: Iterable[str], answers: Sequence[Mapping[str, Any]], attempt: Attempt) -> Retrial:

@@ -12,10 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from dataflow.environments import Environment, environment_of
 from dataflow.execution.threads import environment
@@ -76,9 +75,8 @@ def call_workers(
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
             started = None if early is None or call.env is not None else early.take(threads)
-            workers.append(
-                stack.enter_context(_Worker(number, call, started, threads, locate, envs.get(call.env or "")))
-            )
+            worker = _Worker(number, call, started, threads, locate, envs.get(call.env or ""))
+            workers.append(stack.enter_context(closing(worker)))
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
             for channel in ready([worker.channel for worker in left], LOOK_EVERY):
@@ -101,8 +99,7 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
         if worker.board.steps:
             status.phase = "running"
         for name in worker.call.operators:
-            c = worker.board.counts(name)
-            told = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
+            told, _ = worker.board.counts(name)
             before = seen.get(name)
             if before is not None and name in worker.call.request.get("slices", ()):
                 told = told.after(before)
@@ -192,17 +189,10 @@ class _Worker:
             doing = "while starting" if phase == "start" else "while reading the recording"
             of = f" (operators {', '.join(self.call.operators)})" if self.call.operators else ""
             return RunFailed(f"worker {self.number}{of} {what} {doing}", words)
-        at = f"{phase}()" if phase != "fire" else self._located(operator)
+        at = f"{phase}()" if phase != "fire" else self._locate(self.call, operator, self.board.counts(operator)[1])
         return RunFailed(f"operator {operator!r} {what} in {at}", words, operator)
 
-    def _located(self, operator: str) -> str:
-        return self._locate(self.call, operator, self.board.counts(operator).repeated)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Ends the process."""
         self.board.close()
         self._started.end()
