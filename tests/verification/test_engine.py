@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,34 +22,30 @@ from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call
 
 
-def with_busy(kept: Path, use: str) -> Graph:
-    with Recording(kept) as recording:
-        graph = recorded_graph(recording)
-    return replace(graph, nodes={**graph.nodes, "busy": replace(graph.nodes["busy"], use=f"watched_operators:{use}")})
-
-
-def test_verification_opens_no_network_connection_whatever_the_graph_says(
-    kept: Path, monkeypatch: pytest.MonkeyPatch
+def test_verification_opens_no_network_connection(
+    kept: Path, with_class: Callable[[str, str], Graph], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DATAFLOW_TEST_NO_NETWORK", str(os.getpid()))
-    graph = replace(with_busy(kept, "Portless"), network=Network(listen=("tcp/0.0.0.0:17447",), scouting=True))
+    graph = replace(with_class("busy", "Portless"), network=Network(listen=("tcp/0.0.0.0:17447",), scouting=True))
 
     report = verify(kept, graph=graph, jobs=2)
 
     assert report.identical, report.as_json()
 
 
-def test_an_operator_that_ends_its_process_is_named_with_firing_and_stamp(kept: Path) -> None:
+def test_an_operator_that_ends_its_process_is_named_with_firing_and_stamp(
+    kept: Path, with_class: Callable[[str, str], Graph]
+) -> None:
     with pytest.raises(
         RunFailed,
         match=r"operator 'busy' ended its process with code 7 in call 9 \(fire\) at stamp 1700000000090000000",
     ) as raised:
-        verify(kept, graph=with_busy(kept, "Fatal"), jobs=2)
+        verify(kept, graph=with_class("busy", "Fatal"), jobs=2)
 
     assert raised.value.operator == "busy"
 
 
-def test_progress_is_shown_for_every_operator_and_both_times_are_told(kept: Path) -> None:
+def test_progress_is_shown_for_every_operator(kept: Path) -> None:
     seen: list[Status] = []
 
     report = verify(kept, jobs=2, watch=seen.append)

@@ -37,47 +37,46 @@ def verdicts(report: VerifyReport) -> dict[str, str]:
     return {v.operator: v.verdict for v in report.operators}
 
 
-@pytest.mark.long
-def test_operators_that_share_a_module_are_identical_when_they_ran_apart(tmp_path: Path) -> None:
-    report = verify(recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count"), jobs=1)
-
-    assert verdicts(report) == {"one": "identical", "two": "identical"}
-    assert report.identical
-    assert report.shared == {"one": ("two",), "two": ("one",)}
-    assert report.messages == 16
+COUNTS = "one: Count\ntwo: Count"
+WROTE = "its input 'x' (FeatureVector at stamp 1000000000)"
 
 
 @pytest.mark.long
-def test_an_operator_is_no_culprit_for_what_another_one_sets_in_a_library(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "run.mcap", "strict: Strict\ndivide: Divide")
+@pytest.mark.parametrize(
+    ("operators", "placement", "jobs", "culprit", "shared"),
+    [
+        (COUNTS, "process_each", 1, "", {"one": ("two",), "two": ("one",)}),  # they count in their module
+        ("strict: Strict\ndivide: Divide", "process_each", 1, "", {"divide": ("strict",)}),  # one sets a library
+        ("solve: Solve\ndouble: Double", "process_each", 1, "solve", None),  # it writes into what both are given
+        ("solve: Solve\ndouble: Double", "process_each", 2, "solve", None),
+        ("solve: Solve\ndouble: Double", "one_process", 1, "solve", None),
+        ("solve: Solve\ndouble: Double", "one_process", 2, "solve", None),
+        ("solve: Solve {since: 5}\ndouble: Double", "process_each", 1, "solve", {"double": ("solve",)}),
+        ("keep: Keep\nlate: Late from keep/out", "one_process", 1, "keep", {"late": ("keep",)}),  # its own message
+        ("solve: Solve {since: 0}\nlate: Late", "one_process", 1, "solve", {"late": ("solve",)}),
+        ("solve: Solve {since: 5}\nlate: Late", "one_process", 1, "solve", {"late": ("solve",)}),  # before and after
+    ],
+)
+def test_only_operator_that_writes_into_messages_is_culprit(
+    operators: str,
+    placement: Placement,
+    jobs: int,
+    culprit: str,
+    shared: dict[str, tuple[str, ...]] | None,
+    tmp_path: Path,
+) -> None:
+    report = verify(recorded(tmp_path / "run.mcap", operators, placement), jobs=jobs)
 
-    report = verify(path, jobs=1)
-
-    assert report.identical
-    assert report.shared == {"divide": ("strict",)}
+    names = [line.partition(":")[0] for line in operators.splitlines()]
+    assert verdicts(report) == {name: "culprit" if name == culprit else "identical" for name in names}
+    assert report.identical == (not culprit)
+    assert shared is None or report.shared == shared
+    if shared is None:
+        assert [v.wrote for v in report.operators if v.operator == culprit] == [WROTE]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("placement", ["process_each", "one_process"])
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_the_writer_is_the_culprit_and_not_its_readers(tmp_path: Path, jobs: int, placement: Placement) -> None:
-    report = verify(recorded(tmp_path / "run.mcap", "solve: Solve\ndouble: Double", placement), jobs=jobs)
-
-    assert verdicts(report) == {"solve": "culprit", "double": "identical"}
-    [wrote] = [v.wrote for v in report.operators if v.operator == "solve"]
-    assert wrote == "its input 'x' (FeatureVector at stamp 1000000000)"
-
-
-@pytest.mark.long
-def test_one_that_writes_only_later_is_named_where_a_reader_differs(tmp_path: Path) -> None:
-    report = verify(recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}\ndouble: Double"), jobs=1)
-
-    assert verdicts(report) == {"solve": "culprit", "double": "identical"}
-    assert report.shared == {"double": ("solve",)}
-
-
-@pytest.mark.long
-def test_paranoid_names_it_where_nothing_reads_beside_it(tmp_path: Path) -> None:
+def test_paranoid_finds_writer_without_other_readers(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}")
 
     assert verdicts(verify(path)) == {"solve": "identical"}
@@ -85,35 +84,10 @@ def test_paranoid_names_it_where_nothing_reads_beside_it(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_a_reader_of_a_message_that_its_maker_changed_in_their_process_is_no_culprit(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "run.mcap", "keep: Keep\nlate: Late from keep/out", "one_process")
-
-    report = verify(path, jobs=1)
-
-    assert verdicts(report) == {"keep": "culprit", "late": "identical"}
-    assert report.shared == {"late": ("keep",)}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("since", [0, 5])
-def test_one_that_had_a_message_before_and_after_another_wrote_into_it_is_no_culprit(
-    tmp_path: Path, since: int
-) -> None:
-    path = recorded(tmp_path / "run.mcap", f"solve: Solve {{since: {since}}}\nlate: Late", "one_process")
-
-    report = verify(path, jobs=1)
-
-    assert verdicts(report) == {"solve": "culprit", "late": "identical"}
-    assert report.shared == {"late": ("solve",)}
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("live", [False, True])
-def test_operators_that_shared_a_module_in_the_run_are_called_in_its_order(
-    tmp_path: Path, jobs: int, live: bool
-) -> None:
-    path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count\nthree: Count from one/out", "one_process", live)
+def test_operators_that_shared_a_module_are_called_in_order_of_run(tmp_path: Path, jobs: int, live: bool) -> None:
+    path = recorded(tmp_path / "run.mcap", f"{COUNTS}\nthree: Count from one/out", "one_process", live)
 
     report = verify(path, jobs=jobs)
 
@@ -122,8 +96,8 @@ def test_operators_that_shared_a_module_in_the_run_are_called_in_its_order(
 
 
 @pytest.mark.long
-def test_operators_that_shared_a_module_in_the_run_and_differ_apart_are_named_with_those_beside(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "run.mcap", "one: Count\ntwo: Count", "one_process")
+def test_operator_that_differs_apart_is_named_with_its_mates(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", COUNTS, "one_process")
 
     report = verify(path, only=["one"])
 
@@ -142,7 +116,7 @@ def answer(differences: str, got: str = "b") -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("again", "repeats"), [(answer("1"), True), (answer("2"), False), (answer("1", got="c"), False)]
 )
-def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict[str, Any], repeats: bool) -> None:
+def test_operator_repeats_only_if_all_differences_are_equal(again: dict[str, Any], repeats: bool) -> None:
     asked: list[Trial] = []
 
     def attempt(trials: Sequence[Trial]) -> list[dict[str, Any]]:
@@ -156,9 +130,7 @@ def test_an_operator_repeats_only_where_all_that_differs_is_the_same(again: dict
 
 
 @pytest.mark.parametrize(("since", "downstream"), [(20, True), (30, True), (31, False)])
-def test_a_message_that_was_written_into_counts_where_it_came_before_the_difference(
-    since: int, downstream: bool
-) -> None:
+def test_overwritten_message_counts_only_before_first_difference(since: int, downstream: bool) -> None:
     again = {**answer("1"), "reached": {"clock": ["writer", since]}}
 
     found = retry(["clock"], {"clock": answer("1")}, {"clock": frozenset({"clock"})}, lambda trials: [again])
@@ -167,7 +139,7 @@ def test_a_message_that_was_written_into_counts_where_it_came_before_the_differe
     assert found.repeated == ({} if downstream else {"clock": True})
 
 
-def test_a_parameter_that_another_graph_changes_is_named(tmp_path: Path) -> None:
+def test_changed_parameter_is_named(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}", "one_process")
     text = "graph: test\noperators:\n  src: {use: 'sharing_operators:Matrices'}\n"
     text += "  solve: {use: 'sharing_operators:Solve', inputs: {x: src/out}, params: {since: 6}}"
