@@ -44,12 +44,7 @@ class Line:
     """
 
     def __init__(
-        self,
-        recording: Recording,
-        graph: Graph,
-        operator: str,
-        made: Callable[[], None],
-        read: Callable[[int], None],
+        self, recording: Recording, graph: Graph, operator: str, made: Callable[[], None], read: Callable[[int], None]
     ) -> None:
         """`made` is called before each call that is made again, `read` with the bytes of the inputs of each that is
         read."""

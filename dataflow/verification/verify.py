@@ -297,11 +297,7 @@ def _locate(task: _Task) -> Locate:
 
 
 def _report(
-    task: _Task,
-    answers: Sequence[Mapping[str, Any]],
-    tolerance: float | None,
-    start: float | None,
-    retrial: Retrial,
+    task: _Task, answers: Sequence[Mapping[str, Any]], tolerance: float | None, start: float | None, retrial: Retrial
 ) -> VerifyReport:
     of = {**_answer_of_each(answers), **retrial.instead}
     found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}

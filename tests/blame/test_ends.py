@@ -59,9 +59,7 @@ def sensed(chain: Chain) -> list[int]:
 
 
 @pytest.mark.parametrize("step", [40, 59])  # behind it, a block of earlier calls ends among those that tripped it
-def test_latch_behind_low_pass_leads_to_the_reading_that_tripped_it(
-    step: int, spiky: Path
-) -> None:
+def test_latch_behind_low_pass_leads_to_the_reading_that_tripped_it(step: int, spiky: Path) -> None:
     chain = found(spiky, f"guard/stop.on@{step / 10}")
 
     assert sensed(chain) == [rangers.SPIKE]

@@ -216,9 +216,7 @@ def test_stateless_operator_has_recorded_parameters_in_each_replay() -> None:
     assert replays == [[1.0, 2.0], [3.0, 6.0]]
 
 
-def test_inputs_before_a_kept_state_are_released(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_inputs_before_a_kept_state_are_released(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player_module, "SPACING", 0.0)
     given = Given()
     graph = _graph("Count", "step: drive/step")

@@ -241,10 +241,7 @@ def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
 
 
 def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memory: Path) -> None:
-    happenings = (
-        Happening(0.15, "pause", "", {"span": 6.0}),
-        Happening(0.15, "freeze", "relay", {"span": 12.0}),
-    )
+    happenings = (Happening(0.15, "pause", "", {"span": 6.0}), Happening(0.15, "freeze", "relay", {"span": 12.0}))
     plain = replace(PLAIN, live=True, policy=RESTARTED, count=12, period=20_000_000)
 
     result = check(replace(plain, happenings=happenings), memory)
@@ -356,10 +353,7 @@ FOUND_BY = {
     "pause": replace(
         PLAIN,
         live=True,
-        happenings=(
-            Happening(0.01, "pause", "*", {"span": 6.0}),
-            Happening(0.02, "set", "relay", {"gain": 2.0}),
-        ),
+        happenings=(Happening(0.01, "pause", "*", {"span": 6.0}), Happening(0.02, "set", "relay", {"gain": 2.0})),
     ),
 }
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""

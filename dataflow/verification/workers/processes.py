@@ -115,13 +115,7 @@ class _Worker:
     """One worker process, as its parent sees it."""
 
     def __init__(
-        self,
-        number: int,
-        call: Call,
-        started: Started | None,
-        threads: int,
-        locate: Locate,
-        env: Environment | None,
+        self, number: int, call: Call, started: Started | None, threads: int, locate: Locate, env: Environment | None
     ) -> None:
         """`started`: a process that waits already."""
         variables, python = {**environment(threads), **call.environment}, sys.executable

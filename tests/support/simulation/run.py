@@ -97,12 +97,7 @@ class Outcome:
 
 
 def simulate(
-    plan: RunPlan,
-    machine_: Machine,
-    happenings: Sequence[Happening] = (),
-    *,
-    mode: str = "run",
-    limit: float = LIMIT,
+    plan: RunPlan, machine_: Machine, happenings: Sequence[Happening] = (), *, mode: str = "run", limit: float = LIMIT
 ) -> Outcome:
     """Runs a plan to its end. Raises `Violation` when it comes to none within `limit` s."""
     return Simulation(plan, machine_, happenings, mode, limit).run()
