@@ -14,7 +14,7 @@ from dataflow.records.comparison import Verification
 from dataflow.supervision.core.report import RunFailed
 
 Answer = Mapping[str, Any]
-"""The answer of `part.verify_part`."""
+"""The answer of `job.verify_part`."""
 First = tuple[int, int, str]
 """A first difference: incarnation, index of the record, what was made."""
 

@@ -42,13 +42,13 @@ from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
 from dataflow.verification.stored import StoredStream
-from dataflow.verification.workers import job as part
 from dataflow.verification.workers import partition, slices
+from dataflow.verification.workers.job import verify_part
 from dataflow.verification.workers.prestart import EarlyWorkers
 from dataflow.verification.workers.processes import Call, Locate, Workers, call_workers
 
 Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[Any]]
-"""Answers (what is special of a request, operators), as `part.verify_part` does."""
+"""Answers (what is special of a request, operators), as `verify_part` does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def verify(
     request = _request(task, path, tolerance, paranoid=paranoid, make_effects=make_effects)
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
-        function = f"{part.__name__}:{part.verify_part.__name__}"
+        function = f"{verify_part.__module__}:{verify_part.__name__}"
         asked = [({**request, **more, "operators": list(names)}, names) for more, names in calls]
         return workers([Call(function, *each, env=env_of(played, each[1], task.held)) for each in asked], **options)
 

@@ -22,7 +22,7 @@ from dataflow.process.channel import ChannelClosed, ready
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, Watch
 from dataflow.supervision.interrupts import interrupts
 from dataflow.verification.workers.board import Board
-from dataflow.verification.workers.mail import read_letter, write_letter
+from dataflow.verification.workers.job_file import read_job_file, write_job_file
 from dataflow.verification.workers.prestart import LEAVE_WITHIN, EarlyWorkers, Started, as_bytes
 
 LOOK_EVERY = 0.1
@@ -126,10 +126,10 @@ class _Worker:
             started.spawn(variables, python)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
-        self._letter, self.channel, self._words = started.letter, started.channel, started.words
+        self._job_file, self.channel, self._output = started.job_file, started.channel, started.output
         self.board = Board(started.board, call.operators)
-        write_letter(
-            self._letter,
+        write_job_file(
+            self._job_file,
             {
                 "function": call.function,
                 "request": dict(call.request),
@@ -149,7 +149,7 @@ class _Worker:
             raise self._failed(self._end()) from None
         if kind == "waiting":
             return
-        answer = read_letter(self._letter)
+        answer = read_job_file(self._job_file)
         if kind == "failed":
             raise RunFailed(answer["summary"], answer["traceback"], answer["operator"])
         self.answered, self.answer = True, answer["value"]
@@ -176,9 +176,9 @@ class _Worker:
 
     def _failed(self, what: str) -> RunFailed:
         phase, operator = self.board.place()
-        self._words.seek(0, os.SEEK_END)
-        self._words.seek(max(0, self._words.tell() - LAST_WORDS))
-        words = self._words.read().decode(errors="backslashreplace")
+        self._output.seek(0, os.SEEK_END)
+        self._output.seek(max(0, self._output.tell() - LAST_WORDS))
+        words = self._output.read().decode(errors="backslashreplace")
         if not operator:
             doing = "while starting" if phase == "start" else "while reading the recording"
             of = f" (operators {', '.join(self.call.operators)})" if self.call.operators else ""

@@ -1,4 +1,4 @@
-"""Letters between a process and its workers: plain values, in anonymous files.
+"""Requests and answers between a process and its workers: plain values, in anonymous files.
 
 A writer does not wait for a reader here, as with a socket: a worker that hangs delays no other process.
 """
@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 
 
-def write_letter(descriptor: int, values: Mapping[str, Any]) -> None:
+def write_job_file(descriptor: int, values: Mapping[str, Any]) -> None:
     """Puts plain values in place of what the file holds."""
     with open(descriptor, "r+b", closefd=False) as file:
         file.seek(0)
@@ -19,7 +19,7 @@ def write_letter(descriptor: int, values: Mapping[str, Any]) -> None:
         msgpack.pack(values, file, use_bin_type=True)
 
 
-def read_letter(descriptor: int) -> dict[str, Any]:
+def read_job_file(descriptor: int) -> dict[str, Any]:
     """The plain values that the file holds."""
     with open(descriptor, "rb", closefd=False) as file:
         file.seek(0)
