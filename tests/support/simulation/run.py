@@ -283,9 +283,8 @@ class Simulation:
                 world.after(fields["span"], lambda: world.thaw(process))
             case "pause":
                 labels = {SUPERVISOR, happening.target}
-                for each in [
-                    p for p in world.processes if not p.dead and (happening.target == "*" or p.label in labels)
-                ]:
+                alive = [p for p in world.processes if not p.dead]
+                for each in [p for p in alive if happening.target == "*" or p.label in labels]:
                     world.freeze(each)
                     world.after(fields["span"], functools.partial(world.thaw, each))
 
