@@ -55,7 +55,8 @@ def planned(
     work = {n: books.of(n).duration + PER_FIRING_NS * books.of(n).records for n in operators}
     jobs = jobs or jobs_for(work, cores)
     whole = units(graph, held, operators)
-    alone = {name: work[name] for name in whole if divide and jobs > 1 and not _takes_its_own(graph, held, name)}
+    looped = {n.name for n in graph.nodes.values() if not n.taken.intersection(n.outputs.values()).issubset(held)}
+    alone = {name: work[name] for name in whole if divide and jobs > 1 and name not in looped}
     divided = {name: (work[name], whole.pop(name)) for name in slices.divisible(graph, books, alone)}
     level = sum(work.values()) // jobs if divided else 0
     parts = [set(part) for part in balanced(list(whole.values()), work, jobs, level)]
@@ -78,10 +79,6 @@ def planned(
         for part, cut in zip(parts, cuts, strict=True)
         if part
     ]
-
-
-def _takes_its_own(graph: Graph, held: Collection[str], name: str) -> bool:
-    return not graph.nodes[name].taken.intersection(graph.nodes[name].outputs.values()).issubset(held)
 
 
 def units(graph: Graph, held: Collection[str], operators: Collection[str]) -> dict[str, frozenset[str]]:
