@@ -357,14 +357,8 @@ def main(folder: Path, pages: list[str]) -> None:
     import dataflow.testing
     from dataflow.graph import load_graph
 
-    parts = ("ndimage", "optimize", "spatial", "stats")
-    for name in (
-        "operators.cloud",
-        "operators.sources",
-        "pandas",
-        *(f"scipy.{part}" for part in parts),
-        "rich.console",
-    ):
+    parts = (f"scipy.{part}" for part in ("ndimage", "optimize", "spatial", "stats"))
+    for name in ("operators.cloud", "operators.sources", "pandas", *parts, "rich.console"):
         importlib.import_module(name)  # once, before the pages' processes are forked
     load_graph(REPOSITORY / "graphs" / "perception.yaml")  # and its operators
 
