@@ -17,17 +17,18 @@ from dataflow.verification.retrial import Trial, retry
 from dataflow.verification.verify import verify
 
 Placement = Literal["one_process", "process_each"]
+SOURCE = "  src: {use: 'zoo.operators:Steps', params: {steps: 8}}"
 
 
 def recorded(path: Path, operators: str, placement: Placement = "process_each", live: bool = False) -> Path:
     """A run of operators (`name: Class`, and parameters) that all take the matrices of one source."""
-    lines = ["graph: test", "operators:", "  src: {use: 'sharing_operators:Matrices'}"]
+    lines = ["graph: test", "operators:", SOURCE]
     for line in operators.splitlines():
         name, _, rest = line.strip().partition(": ")
         use, _, more = rest.partition(" ")
         taken = "src/out" if "from" not in more else more.partition("from ")[2]
         params = f"params: {more}" if more.startswith("{") else ""
-        fields = [f"use: 'sharing_operators:{use}'", f"inputs: {{x: {taken}}}", params]
+        fields = [f"use: 'zoo.operators:{use}'", f"inputs: {{x: {taken}}}", params]
         lines.append(f"  {name}: {{{', '.join(filter(None, fields))}}}")
     run(load_text("\n".join(lines)), placement=placement, record=path, live=live)
     return path
@@ -38,7 +39,7 @@ def verdicts(report: VerifyReport) -> dict[str, str]:
 
 
 COUNTS = "one: Count\ntwo: Count"
-WROTE = "its input 'x' (FeatureVector at stamp 1000000000)"
+WROTE = "its input 'x' (FeatureVector at stamp 1000000000000000000)"
 
 
 @pytest.mark.long
@@ -47,14 +48,16 @@ WROTE = "its input 'x' (FeatureVector at stamp 1000000000)"
     [
         (COUNTS, "process_each", 1, "", {"one": ("two",), "two": ("one",)}),  # they count in their module
         ("strict: Strict\ndivide: Divide", "process_each", 1, "", {"divide": ("strict",)}),  # one sets a library
-        ("solve: Solve\ndouble: Double", "process_each", 1, "solve", None),  # it writes into what both are given
-        ("solve: Solve\ndouble: Double", "process_each", 2, "solve", None),
-        ("solve: Solve\ndouble: Double", "one_process", 1, "solve", None),
-        ("solve: Solve\ndouble: Double", "one_process", 2, "solve", None),
-        ("solve: Solve {since: 5}\ndouble: Double", "process_each", 1, "solve", {"double": ("solve",)}),
-        ("keep: Keep\nlate: Late from keep/out", "one_process", 1, "keep", {"late": ("keep",)}),  # its own message
-        ("solve: Solve {since: 0}\nlate: Late", "one_process", 1, "solve", {"late": ("solve",)}),
-        ("solve: Solve {since: 5}\nlate: Late", "one_process", 1, "solve", {"late": ("solve",)}),  # before and after
+        ("solve: Overwrite\ndouble: Hard", "process_each", 1, "solve", None),  # it writes into what both are given
+        ("solve: Overwrite\ndouble: Hard", "process_each", 2, "solve", None),
+        ("solve: Overwrite\ndouble: Hard", "one_process", 1, "solve", None),
+        ("solve: Overwrite\ndouble: Hard", "one_process", 2, "solve", None),
+        ("solve: Overwrite {since: 5}\ndouble: Hard", "process_each", 1, "solve", {"double": ("solve",)}),
+        # into a message that it made before
+        ("keep: KeepsEmitted\nlate: Before from keep/out", "one_process", 1, "keep", {"late": ("keep",)}),
+        ("solve: Overwrite {since: 0}\nlate: Before", "one_process", 1, "solve", {"late": ("solve",)}),
+        # the reader had the message before and after
+        ("solve: Overwrite {since: 5}\nlate: Before", "one_process", 1, "solve", {"late": ("solve",)}),
     ],
 )
 def test_only_operator_that_writes_into_messages_is_culprit(
@@ -77,7 +80,7 @@ def test_only_operator_that_writes_into_messages_is_culprit(
 
 @pytest.mark.long
 def test_paranoid_finds_writer_without_other_readers(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}")
+    path = recorded(tmp_path / "run.mcap", "solve: Overwrite {since: 5}")
 
     assert verdicts(verify(path)) == {"solve": "identical"}
     assert verdicts(verify(path, paranoid=True)) == {"solve": "culprit"}
@@ -140,9 +143,9 @@ def test_overwritten_message_counts_only_before_first_difference(since: int, dow
 
 
 def test_changed_parameter_is_named(tmp_path: Path) -> None:
-    path = recorded(tmp_path / "run.mcap", "solve: Solve {since: 5}", "one_process")
-    text = "graph: test\noperators:\n  src: {use: 'sharing_operators:Matrices'}\n"
-    text += "  solve: {use: 'sharing_operators:Solve', inputs: {x: src/out}, params: {since: 6}}"
+    path = recorded(tmp_path / "run.mcap", "solve: Overwrite {since: 5}", "one_process")
+    text = f"graph: test\noperators:\n{SOURCE}\n"
+    text += "  solve: {use: 'zoo.operators:Overwrite', inputs: {x: src/out}, params: {since: 6}}"
 
     report = verify(path, graph=load_text(text), only=["solve"])
 
