@@ -11,11 +11,14 @@ from typing import Any
 import msgpack
 import pytest
 
-from dataflow.graph import Graph
+from dataflow.execution.threads import environment
+from dataflow.graph import Graph, load_text
 from dataflow.graph.sections import Network
 from dataflow.recording import Recording
+from dataflow.recording.streams.facts import machine_facts, record_elsewhere
 from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.supervision.core.report import RunFailed, Status
+from dataflow.verification.facts import differing_facts
 from dataflow.verification.verify import verify
 from dataflow.verification.workers import job
 from dataflow.verification.workers.board import Board
@@ -97,3 +100,15 @@ def test_several_environments_share_the_jobs(kept: Path) -> None:
 
     with pytest.raises(RunFailed, match=r"^one, two$"):
         verify(kept, graph=graph, jobs=2, workers=count)
+
+
+def test_facts_of_each_machine_of_a_run_are_compared() -> None:
+    graph = load_text('graph: none\noperators: {in: {use: "dataflow.remote:Twist"}}')
+    here = machine_facts(environment(1))
+    robot = {record_elsewhere(group, "robot"): values for group, values in here.items() if group != "threads"}
+    assert differing_facts({**here, **robot}, graph) == ()
+
+    numpy = here["packages"]["numpy"]
+    robot[record_elsewhere("packages", "robot")] = {**here["packages"], "numpy": "1.26.4"}
+
+    assert differing_facts({**here, **robot}, graph) == (("packages numpy on robot", "1.26.4", numpy),)

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from zoo.cages import CAGES
 
 from dataflow.graph.load import load_text
 from dataflow.records.comparison import Difference, Verification
+from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.retrial import Trial, retry
@@ -107,6 +109,20 @@ def test_operator_that_differs_apart_is_named_with_its_mates(tmp_path: Path) -> 
     assert report.culprits == ("one",)
     assert report.repeats("one")
     assert report.mates == {"one": ("two",)}
+
+
+@pytest.mark.long
+def test_hard_operators_in_one_process_get_the_right_verdicts(tmp_path: Path) -> None:
+    """`benchmarks/verdicts.py` runs them in all ways."""
+    cage = CAGES["each for itself"]
+    with pytest.raises(RunFailed, match="it does not close"):
+        run(cage.graph(), placement="one_process", record=tmp_path / "run.mcap")
+
+    report = verify(tmp_path / "run.mcap")
+
+    assert {v.operator: report.verdict(v) for v in report.operators} == cage.together
+    assert report.repeated == {name: False for name, verdict in cage.together.items() if verdict == "culprit"}
+    assert not report.shared
 
 
 def answer(differences: str, got: str = "b") -> dict[str, Any]:

@@ -15,7 +15,7 @@ from dataflow.messages import FeatureVector, Imu, Message
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.recorded_run import recorded_graph
-from dataflow.supervision.run import run
+from dataflow.supervision.run import replay, run
 from dataflow.verification.gate import Checked, check
 from dataflow.verification.verify import verify
 
@@ -228,3 +228,17 @@ def test_recorded_graph_is_not_read_if_another_is_given(kept: Path, tmp_path: Pa
     path = tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": "no graph"}})
 
     assert verify(path, graph=graph).identical
+
+
+@pytest.mark.long
+def test_recording_with_gaps_is_replayed_in_processes_as_in_one(kept: Path, tmp_path: Path) -> None:
+    def without(found: Recorded) -> Kept:
+        return [] if found.stream == "kept/robot/imu" and found.seq in (10, 11, 15) else as_it_is(found)
+
+    path = tampered(kept, tmp_path / "gapped.mcap", messages=without)
+
+    apart = replay(path, placement="process_each")
+
+    assert apart.digests() == replay(path, placement="one_process").digests()
+    with Recording(path) as recording:
+        assert apart.streams["kept/robot/imu"][0] == recording.streams["kept/robot/imu"].count
