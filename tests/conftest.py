@@ -39,7 +39,7 @@ ROOMS = {
 }  # fmt: skip
 """Folders of tests by marker; a test anywhere else is a `unit` test."""
 SLOW = pytest.StashKey[set[str]]()
-"""Libraries that take seconds to import and were imported when tests were collected."""
+"""Libraries that take long to import and were imported when tests were collected."""
 sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 
 
@@ -77,7 +77,7 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
         gc.freeze()
         gc.set_threshold(20_000, 10, 10)  # instead of 700: a seventh of the time of tests that draw many examples
         gc.enable()
-        session.config.stash[SLOW] = {"open3d", "pandas", "rerun", "torch"} & sys.modules.keys()
+        session.config.stash[SLOW] = {"mcp", "open3d", "pandas", "rerun", "scipy.stats", "torch"} & sys.modules.keys()
 
 
 @cache
@@ -150,7 +150,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
 
 @pytest.fixture(scope="session")
 def imported_by_collection(pytestconfig: pytest.Config) -> set[str]:
-    """Libraries that take seconds to import and that some module of tests imports when it is collected."""
+    """Libraries that take long to import and that some module of tests imports when it is collected."""
     return pytestconfig.stash[SLOW]
 
 

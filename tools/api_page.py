@@ -24,16 +24,8 @@ reference pages of their own.
 """
 
 SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    (
-        "Recordings",
-        "dataflow",
-        ("open", "RecordedStreams", "RecordedStream", "Joined"),
-    ),
-    (
-        "Graphs and runs",
-        "dataflow",
-        ("Graph", "run", "replay", "launch", "verify", "Session", "RunResult", "Verified"),
-    ),
+    ("Recordings", "dataflow", ("open", "RecordedStreams", "RecordedStream", "Joined")),
+    ("Graphs and runs", "dataflow", ("Graph", "run", "replay", "launch", "verify", "Session", "RunResult", "Verified")),
     ("One operator on streams", "dataflow", ("play", "Played")),
     (
         "Writing operators",

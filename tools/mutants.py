@@ -26,18 +26,8 @@ from pathlib import Path
 from warm_tests import WarmTests
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-COPIED = (
-    "dataflow",
-    "operators",
-    "tests",
-    "tools",
-    "graphs",
-    "recordings",
-    "docs",
-    "benchmarks",
-    "pyproject.toml",
-    "README.md",
-)
+FOLDERS = ("dataflow", "operators", "tests", "tools", "graphs", "recordings", "docs", "benchmarks")
+COPIED = (*FOLDERS, "pyproject.toml", "README.md")
 
 OTHER: dict[type[ast.AST], type[ast.AST]] = {}
 for one, other in (

@@ -25,7 +25,6 @@ import pytest
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_name, "1")  # as in tests/conftest.py, before a library reads it
 
-
 PR_SET_CHILD_SUBREAPER = 36
 
 
@@ -85,11 +84,8 @@ class _Plugin:
             self._failed.append(report.nodeid)
 
     def outcome(self, passed: bool) -> Outcome:
-        libraries = [
-            name
-            for name, module in [*sys.modules.items()]
-            if "site-packages" in (getattr(module, "__file__", "") or "")
-        ]
+        files = [(name, getattr(module, "__file__", None) or "") for name, module in [*sys.modules.items()]]
+        libraries = [name for name, file in files if "site-packages" in file]
         return Outcome(passed, self._failed, dict(self._seconds), libraries)
 
 

@@ -112,13 +112,9 @@ class Effects:
             if not any(place_of(entry) in self._others for entry in entries_of(given)):
                 continue
             kept = [(entry, self._others.get(place_of(entry), entry.value)) for entry in entries_of(given)]
-            entries = [_entry(entry, message) for entry, message in kept if message is not None]
-            if isinstance(given, tuple):
-                inputs[name] = tuple(entries)
-            elif isinstance(given, Mapping):
-                inputs[name] = {entry.stream: entry for entry in entries}
-            else:
-                inputs[name] = entries[0] if entries else self._sample_before(line, number, name, given)
+            inputs[name] = _like(given, [_entry(entry, message) for entry, message in kept if message is not None])
+            if inputs[name] is None:
+                inputs[name] = self._sample_before(line, number, name, given)
             if not inputs[name] and not isinstance(given, tuple) and _is_needed(line, name):
                 return None
         return inputs
@@ -147,13 +143,17 @@ def with_messages(firing: Firing, messages: Mapping[Slot, Message]) -> Mapping[s
     for name in {name for name, _ in messages}:
         given = inputs[name]
         entries = [_entry(e, messages.get((name, k), e.value)) for k, e in enumerate(entries_of(given))]
-        if isinstance(given, Entry):
-            inputs[name] = entries[0]
-        elif isinstance(given, Mapping):
-            inputs[name] = {entry.stream: entry for entry in entries}
-        else:
-            inputs[name] = tuple(entries)
+        inputs[name] = _like(given, entries)
     return inputs
+
+
+def _like(given: InputValue, entries: Sequence[Entry]) -> InputValue:
+    """Returns entries in the form in which an input was given others; None for none in place of a single one."""
+    if isinstance(given, tuple):
+        return tuple(entries)
+    if isinstance(given, Mapping):
+        return {entry.stream: entry for entry in entries}
+    return entries[0] if entries else None
 
 
 def _entry(entry: Entry, message: Message) -> Entry:

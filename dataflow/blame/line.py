@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from dataflow.capture.capture import changes_between, shot_of
-from dataflow.capture.captured import Shot, make_change
+from dataflow.capture.captured import Shot, make_change, set_up
 from dataflow.debugging.debugger import Debugger
 from dataflow.debugging.fired import Fired
 from dataflow.execution.calls import Calls
@@ -21,13 +21,11 @@ from dataflow.records.cuts import is_known, parameters_at
 from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import seeding_of
-from dataflow.sync import NEVER, Firing
+from dataflow.sync import Firing
 from dataflow.sync.entries import entries_of
 
 MOST_BYTES = 2**28
 """Of the states that are kept of one operator."""
-
-
 AHEAD = 100_000_000
 """Duration (ns) of calls before those that are asked for, that are read with them."""
 
@@ -46,12 +44,7 @@ class Line:
     """
 
     def __init__(
-        self,
-        recording: Recording,
-        graph: Graph,
-        operator: str,
-        made: Callable[[], None],
-        read: Callable[[int], None],
+        self, recording: Recording, graph: Graph, operator: str, made: Callable[[], None], read: Callable[[int], None]
     ) -> None:
         """`made` is called before each call that is made again, `read` with the bytes of the inputs of each that is
         read."""
@@ -177,28 +170,21 @@ class Line:
             assert self._calls is not None
             self._calls.restore(self._states[near], (self.records[near].incarnation, self.records[near].stamp - 1))
         self._at = near
-        for passed in range(near, number):
-            if passed in self.shots:
-                self.fire(passed, self.shots[passed].firing)
+        self._pass(near, number)
         self._at = -1 if anew else number
         self._keep(number)
 
     def is_as_new(self, number: int) -> bool:
         """Returns whether the state before a call is that of a new operator; False where the operator gives none."""
         if number not in self._as_new:
-            self.begin(number, anew=True)
-            new = self._state(number)
-            self.begin(number)
-            self._as_new[number] = new is not None and self._state(number) == new
+            self._as_new[number] = self.has_forgotten(number, number)
         return self._as_new[number]
 
     def has_forgotten(self, begin: int, number: int) -> bool:
         """Returns whether an operator that is new before the call `begin` has the recorded state before `number`; False
         where the operator gives none."""
         self.begin(begin, anew=True)
-        for passed in range(begin, number):
-            if passed in self.shots:
-                self.fire(passed, self.shots[passed].firing)
+        self._pass(begin, number)
         new = self._state(number)
         self.begin(number)
         return new is not None and self._state(number) == new
@@ -216,9 +202,14 @@ class Line:
             self.begin(first)
             for passed in range(first, number + 1):
                 self._as_new[passed] = self._state(passed) == new
-                if passed in self.shots:
-                    self.fire(passed, self.shots[passed].firing)
+                self._pass(passed, passed + 1)
         return self._as_new[number]
+
+    def _pass(self, first: int, end: int) -> None:
+        """Makes the held calls from one to before another as they were."""
+        for number in range(first, end):
+            if number in self.shots:
+                self.fire(number, self.shots[number].firing)
 
     def _state(self, number: int) -> bytes | None:
         """The state of the operator, just before a call."""
@@ -232,11 +223,7 @@ class Line:
         place = record.incarnation, record.index
         at_setup, since = parameters_at(r for r in self._changes if (r.incarnation, r.index) < place)
         self._calls = calls = Calls(node, node.make(), self._graph.seed, version=self._seeding, effects=self._journal)
-        for name, value in at_setup.items():
-            calls.parameter(name, value, (0, NEVER))
-        calls.setup()
-        for name, value in since.items():
-            calls.parameter(name, value, (0, NEVER))
+        set_up(calls, at_setup, since)
 
     def fire(self, number: int, firing: Firing, *, other: bool = False) -> Mapping[str, Message] | None:
         """Makes a call, with the recorded inputs or `other` ones, and the changes behind it; returns its messages by

@@ -186,7 +186,7 @@ class Chain:
             "stamp": self.stamp,
             "beyond_the_end": self.late,
             "links": [_link_as_json(link) for link in self.links],
-            "sensed": [[*place] for place in dict.fromkeys(_all_messages(self.sensed))],
+            "sensed": [[*place] for place in dict.fromkeys(p for link in self.sensed for p in link.messages)],
             "whole": self.whole,
             "no_change_shows_at": [[*call] for call in self.loose],
             "tried": dict(self.tried),
@@ -214,7 +214,3 @@ def _link_as_json(link: Link) -> dict[str, Any]:
         "to": link.last,
         "effects": effects,
     }
-
-
-def _all_messages(links: Sequence[Link]) -> list[Place]:
-    return [place for link in links for place in link.messages]

@@ -194,17 +194,9 @@ def _recorded(fired: Fired) -> dict[str, Message]:
 
 
 def _setting(recording: Recording, debugger: Debugger) -> Setting:
-    node = debugger.node
-    return Setting(
-        node.name,
-        node.use,
-        dict(node.params),
-        debugger.graph.seed,
-        seeding_of(recording),
-        debugger.graph.threads,
-        dict(node.outputs),
-        node.env,
-    )
+    node, graph = debugger.node, debugger.graph
+    known = graph.seed, seeding_of(recording), graph.threads
+    return Setting(node.name, node.use, dict(node.params), *known, dict(node.outputs), node.env)
 
 
 def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fired, wrong: Wrong) -> Iterator[Beginning]:

@@ -138,11 +138,7 @@ class Captured:
         with limited_threads(setting.threads):
             calls = Calls(node, node.make(), setting.seed, version=setting.seeding, effects=journal)
             try:
-                for name, value in self.at_setup.items():
-                    calls.parameter(name, value, (0, NEVER))
-                calls.setup()
-                for name, value in self.since.items():
-                    calls.parameter(name, value, (0, NEVER))
+                set_up(calls, self.at_setup, self.since)
                 if self.state is not None:
                     self._take_over(calls, self.state)
                 return _made(calls, journal, self.shots)
@@ -299,6 +295,15 @@ def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outc
         if 0 < left <= BEFORE:
             before.append({port: message.digest() for port, message in outputs.items()})
     return Outcome(shots[-1].firing, ports, outputs, None, tuple(before))
+
+
+def set_up(calls: Calls, at_setup: Mapping[str, Any], since: Mapping[str, Any]) -> None:
+    """Sets an operator up, with the parameters that were changed before its `setup()` and `since`."""
+    for name, value in at_setup.items():
+        calls.parameter(name, value, (0, NEVER))
+    calls.setup()
+    for name, value in since.items():
+        calls.parameter(name, value, (0, NEVER))
 
 
 def make_change(calls: Calls, change: Change) -> None:

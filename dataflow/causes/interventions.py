@@ -251,9 +251,7 @@ class Interventions:
 
     def _fix_identifiers(self) -> None:
         for name in ("uuid1", "uuid4"):
-            real = getattr(uuid, name)
-            fixed = partial(self._identifier, real)
-            setattr(uuid, name, fixed)
+            setattr(uuid, name, partial(self._identifier, getattr(uuid, name)))
 
     def _identifier(self, real: Callable[..., uuid.UUID], *args: Any, **kwargs: Any) -> uuid.UUID:
         return uuid.UUID(bytes=self._bytes(UUID, 16), version=4) if self._gives(UUID) else real(*args, **kwargs)

@@ -17,18 +17,7 @@ from typing import Any
 
 from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
-from dataflow.causes.sources import (
-    CHANCE,
-    COMPILED,
-    HASHES,
-    HEAP,
-    INPUT,
-    LOCALE,
-    MODULE,
-    THREADS,
-    kind_of,
-    name_of,
-)
+from dataflow.causes.sources import CHANCE, COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, THREADS, kind_of, name_of
 from dataflow.causes.traps import Site, Traps
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.judge import Judge

@@ -284,11 +284,7 @@ class _Alone:
 
 
 def reasons(
-    path: Path,
-    report: VerifyReport,
-    operators: Sequence[str],
-    graph: Graph | None = None,
-    progress: Progress = _unseen,
+    path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None, progress: Progress = _unseen
 ) -> list[Why]:
     """Returns the answer for each of `operators`, or for the culprits where none are named."""
     return [why(path, report, name, graph=graph, progress=progress) for name in operators or report.culprits]

@@ -158,7 +158,7 @@ class Debugger:
             self._reach(number, through)
         held = self._ring.get(number)
         if self._reached != number or held is None:
-            raise DebugError(self._unreached(number))
+            raise DebugError(f"call {number} of {self.node.name} cannot be made again: {self._why_not()}")
         if held.stale:
             self._leave()
         return held
@@ -543,9 +543,6 @@ class Debugger:
                 then = recorded_message(self._recording, stream, place, emission.stamp)
             fields = () if here is None or then is None else tuple(differences(then, here, None)[0])
             yield Made(port, stream, same=False, here=here, recorded=then, fields=fields)
-
-    def _unreached(self, number: int) -> str:
-        return f"call {number} of {self.node.name} cannot be made again: {self._why_not()}"
 
     def _why_not(self) -> str:
         """Returns why the calls behind the last one that was made cannot be."""

@@ -170,9 +170,7 @@ def described(value: Any, origin: int) -> str:
         case Message():
             return f"{value.SCHEMA} at {(value.stamp - origin) * 1e-9:.3f} s"
         case Mapping():
-            return (
-                "; ".join(f"{stream}: {described(message, origin)}" for stream, message in value.items()) or "nothing"
-            )
+            return "; ".join(f"{name}: {described(message, origin)}" for name, message in value.items()) or "nothing"
         case _:
             last = f", the last {described(value[-1], origin)}" if value else ""
             return f"{len(value):,} message{'' if len(value) == 1 else 's'}{last}"

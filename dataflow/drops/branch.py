@@ -138,12 +138,7 @@ class HeldRunner(OperatorRunner):
 
     def __init__(self, graph: Graph, player: Player, emitter: HandOver, held: Sequence[Loss]) -> None:
         super().__init__(
-            player.node,
-            emitter,
-            static=graph.static,
-            seed=graph.seed,
-            operator=player.operator.shell,
-            lossy=True,
+            player.node, emitter, static=graph.static, seed=graph.seed, operator=player.operator.shell, lossy=True
         )
         self.calls = PlayedCalls(player)
         self._watched = 0

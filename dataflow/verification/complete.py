@@ -137,14 +137,7 @@ def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         feeding = _plan(recording, graph)
         store = _Store(recording, graph, feeding, part)
         work = Recomputation(
-            recording,
-            graph,
-            feeding,
-            log,
-            made=store.take,
-            read=store.take,
-            ended=store.sink.end,
-            watcher=board,
+            recording, graph, feeding, log, made=store.take, read=store.take, ended=store.sink.end, watcher=board
         )
         results = work.run(until=lambda: any(runner.result.first for runner in work.runners.values()))
         ledger = read_ledger(recording, graph, Books(log, graph), feeding.operators)

@@ -19,7 +19,7 @@ from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.errors import WRONG_INPUT
-from dataflow.verification.report import StandIn, VerifyReport
+from dataflow.verification.report import VerifyReport
 
 FORMAT = 2
 
@@ -283,9 +283,7 @@ def _check_once(
         return could_not(str(failure), failure.details, internal=failure.internal)
     except WRONG_INPUT as error:
         return could_not(str(error).strip())
-    except (
-        Exception
-    ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
+    except Exception as error:  # a fault of this program's in one file must not keep the others from being looked at
         return could_not(f"{type(error).__name__}: {error}", traceback.format_exc(), internal=True)
     missing = () if graph is None else recorded_but_not_in(graph, path)
     judged = judge(report, accepted or {})
@@ -338,16 +336,13 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
         judged.append(Judged(v.operator, verdict, outcome, v.whole and steady and not v.wrote))
     absent = (Judged(name, "not here", firm=False) for name in report.absent)
-    return (*judged, *absent, *_judged_stand_ins(report, report.stand_ins))
-
-
-def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Iterable[Judged]:
     changed = {s.maker for s in report.changed}
-    for stand_in in stand_ins:
-        if stand_in.operator in changed:
-            yield Judged(stand_in.operator, "changed", firm=False)
-        elif not stand_in.whole:
-            yield Judged(stand_in.operator, "unverifiable", firm=False)
+    stand_ins = (
+        Judged(s.operator, "changed" if s.operator in changed else "unverifiable", firm=False)
+        for s in report.stand_ins
+        if s.operator in changed or not s.whole
+    )
+    return (*judged, *absent, *stand_ins)
 
 
 def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:

@@ -10,7 +10,7 @@ from dataflow.recording.streams.cutting import Cut
 from dataflow.records.comparison import Verification
 from dataflow.supervision.core.report import OperatorCounts
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.ledger import Account
+from dataflow.verification.ledger import Ledger
 from dataflow.verification.stored import StoredStream
 
 Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "changed", "unverifiable"]
@@ -34,8 +34,9 @@ class StandIn:
     part: bool = False
 
     @staticmethod
-    def of(operator: str, account: Account, *, ended: bool, torn: bool, part: bool = False) -> StandIn:
-        cut = not ended and (part or not account.finished or (torn and account.not_stored > 0))
+    def of(operator: str, ledger: Ledger) -> StandIn:
+        account, part = ledger.accounts[operator], ledger.part is not None
+        cut = not ledger.ended and (part or not account.finished or (ledger.torn and account.not_stored > 0))
         return StandIn(
             operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut, part
         )

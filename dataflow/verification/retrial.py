@@ -14,7 +14,7 @@ from dataflow.records.comparison import Verification
 from dataflow.supervision.core.report import RunFailed
 
 Answer = Mapping[str, Any]
-"""The answer of `part.verify_part`."""
+"""The answer of `job.verify_part`."""
 First = tuple[int, int, str]
 """A first difference: incarnation, index of the record, what was made."""
 
@@ -145,7 +145,7 @@ def _try(outcome: Retrial, trials: Sequence[Trial], attempt: Try) -> dict[str, A
     """The answer for each operator that is asked for."""
     told: dict[str, Answer] = {}
     for trial, answer in zip(trials, attempt(trials) if trials else (), strict=True):
-        outcome.wrote.update(_wrote(answer))
+        outcome.wrote.update((name, found["wrote"]) for name, found in answer["operators"].items() if found["wrote"])
         told |= dict.fromkeys(trial.asked, answer)
     return told
 
@@ -153,10 +153,6 @@ def _try(outcome: Retrial, trials: Sequence[Trial], attempt: Try) -> dict[str, A
 def _others(answer: Answer, than: Answer) -> tuple[str, ...]:
     """Returns the operators of an answer that are not in another one."""
     return tuple(name for name in answer["operators"] if name not in than["operators"])
-
-
-def _wrote(answer: Answer) -> dict[str, str]:
-    return {name: values["wrote"] for name, values in answer["operators"].items() if values["wrote"]}
 
 
 def _alike(answer: Answer, other: Answer, name: str) -> bool:

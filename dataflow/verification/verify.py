@@ -42,13 +42,13 @@ from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
 from dataflow.verification.stored import StoredStream
-from dataflow.verification.workers import job as part
 from dataflow.verification.workers import partition, slices
+from dataflow.verification.workers.job import verify_part
 from dataflow.verification.workers.prestart import EarlyWorkers
 from dataflow.verification.workers.processes import Call, Locate, Workers, call_workers
 
 Attempt = Callable[[Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]], list[Any]]
-"""Answers (what is special of a request, operators), as `part.verify_part` does."""
+"""Answers (what is special of a request, operators), as `verify_part` does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def verify(
     request = _request(task, path, tolerance, paranoid=paranoid, make_effects=make_effects)
 
     def attempt(calls: Iterable[tuple[Mapping[str, Any], tuple[str, ...]]]) -> list[Any]:
-        function = f"{part.__name__}:{part.verify_part.__name__}"
+        function = f"{verify_part.__module__}:{verify_part.__name__}"
         asked = [({**request, **more, "operators": list(names)}, names) for more, names in calls]
         return workers([Call(function, *each, env=env_of(played, each[1], task.held)) for each in asked], **options)
 
@@ -297,11 +297,7 @@ def _locate(task: _Task) -> Locate:
 
 
 def _report(
-    task: _Task,
-    answers: Sequence[Mapping[str, Any]],
-    tolerance: float | None,
-    start: float | None,
-    retrial: Retrial,
+    task: _Task, answers: Sequence[Mapping[str, Any]], tolerance: float | None, start: float | None, retrial: Retrial
 ) -> VerifyReport:
     of = {**_answer_of_each(answers), **retrial.instead}
     found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}
@@ -341,10 +337,7 @@ def _report(
             if stream in answer["digests"]
         },
         outputs={name: tuple(nodes[name].outputs.values()) for name in task.operators},
-        producers={
-            name: frozenset(task.graph.streams[s].node for taken in nodes[name].inputs.values() for s in taken)
-            for name in task.operators
-        },
+        producers={name: frozenset(task.graph.streams[s].node for s in nodes[name].taken) for name in task.operators},
         start=start,
         torn=task.torn,
         part=task.ledger.part,
@@ -389,19 +382,9 @@ def _answer_of_each(answers: Sequence[Mapping[str, Any]]) -> Mapping[str, Mappin
 
 def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
     """The books of a stand-in, with what reading its messages has shown."""
-    made = StandIn.of(
-        name,
-        task.ledger.accounts[name],
-        ended=task.ledger.ended,
-        torn=task.ledger.torn,
-        part=task.ledger.part is not None,
-    )
-    read = [s for s in stored if s.maker == name]
-    return replace(
-        made,
-        unaccounted=max(made.unaccounted, sum(s.uncalled for s in read)),
-        missing=max(made.missing, sum(s.missing for s in read)),
-    )
+    made, read = StandIn.of(name, task.ledger), [s for s in stored if s.maker == name]
+    unaccounted = max(made.unaccounted, sum(s.uncalled for s in read))
+    return replace(made, unaccounted=unaccounted, missing=max(made.missing, sum(s.missing for s in read)))
 
 
 def _retry(task: _Task, culprits: Iterable[str], answers: Sequence[Mapping[str, Any]], attempt: Attempt) -> Retrial:

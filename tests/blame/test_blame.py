@@ -18,7 +18,7 @@ from dataflow.blame.field import Field, differ
 from dataflow.blame.line import Line
 from dataflow.blame.links import Chain
 from dataflow.blame.nudge import groups, nudged
-from dataflow.graph import load_text
+from dataflow.graph import Graph, load_text
 from dataflow.graph.model import Node
 from dataflow.messages import Detections2D, FeatureVector, Pose
 from dataflow.recording import Recording
@@ -31,9 +31,19 @@ KEEPS = 85
 """The seed of a graph without selections before a state, of which the value is two calls old."""
 
 
-def found(case: blamed_graphs.Case, path: Path, budget: float = 600.0) -> Chain:
+def blamed(path: Path, field: str, graph: Graph | None = None, budget: float = 600.0) -> Chain:
     with Recording(path) as recording:
-        return Blame(recording, Field.parse(case.field), budget=budget).find()
+        return Blame(recording, Field.parse(field), graph, budget=budget).find()
+
+
+def found(case: blamed_graphs.Case, path: Path, budget: float = 600.0) -> Chain:
+    return blamed(path, case.field, budget=budget)
+
+
+def ran(path: Path, *operators: str) -> Path:
+    """Records a run of the sensors and operators."""
+    dataflow.run(blamed_graphs.graph_of(*operators), record=path)
+    return path
 
 
 def sensed(chain: Chain) -> set[blamed_graphs.Sensed]:
@@ -68,7 +78,7 @@ def test_the_chain_of_a_made_graph_is_the_true_one(seed: int, tmp_path: Path) ->
     assert case.truth.must <= sensed(chain) <= case.truth.must | case.truth.may
 
 
-def test_what_the_time_does_not_suffice_for_is_named(kept: tuple[blamed_graphs.Case, Path]) -> None:
+def test_calls_left_out_for_lack_of_time_are_named(kept: tuple[blamed_graphs.Case, Path]) -> None:
     chain = found(*kept, budget=1e-9)
 
     assert not chain.whole
@@ -100,41 +110,35 @@ def test_the_inputs_of_all_operators_together_are_bounded(two: Path, monkeypatch
         ("o2/out.vectors[@1", "'[' was never closed"),
     ],
 )
-def test_a_value_that_cannot_be_asked_for_is_refused(
-    kept: tuple[blamed_graphs.Case, Path], field: str, problem: str
-) -> None:
-    with Recording(kept[1]) as recording, pytest.raises((BlameError, ValueError)) as caught:
-        Blame(recording, Field.parse(field)).find()
+def test_unknown_value_is_refused(kept: tuple[blamed_graphs.Case, Path], field: str, problem: str) -> None:
+    with pytest.raises((BlameError, ValueError)) as caught:
+        blamed(kept[1], field)
 
     assert problem in str(caught.value)
 
 
-def test_code_that_gives_something_else_now_is_not_blamed(kept: tuple[blamed_graphs.Case, Path]) -> None:
+def test_changed_code_is_refused(kept: tuple[blamed_graphs.Case, Path]) -> None:
     case, path = kept
     other = load_text(case.text.replace("blamed_graphs:Keep", "blamed_graphs:KeepHalf"))
 
-    with Recording(path) as recording, pytest.raises(BlameError, match="does not give what was recorded"):
-        Blame(recording, Field.parse(case.field), other).find()
+    with pytest.raises(BlameError, match="does not give what was recorded"):
+        blamed(path, case.field, other)
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("two") / "run.mcap"
-    dataflow.run(blamed_graphs.graph_of(*TWO), record=path)
-    return path
+    return ran(tmp_path_factory.mktemp("two") / "run.mcap", *TWO)
 
 
 @pytest.mark.parametrize(
     ("other", "problem"), [("KeepHalf", "does not give what was"), ("Unsteady", "does not repeat")]
 )
-def test_code_in_front_of_the_value_that_gives_something_else_is_not_blamed(
-    two: Path, other: str, problem: str
-) -> None:
+def test_changed_or_unsteady_code_upstream_is_refused(two: Path, other: str, problem: str) -> None:
     graph = blamed_graphs.graph_of(TWO[0].replace("Keep", other), TWO[1])
     blamed_graphs.Unsteady.given.clear()
 
-    with Recording(two) as recording, pytest.raises(BlameError, match=f"of keep {problem}"):
-        Blame(recording, Field.parse(blamed_graphs.at(40, "scale/out")), graph).find()
+    with pytest.raises(BlameError, match=f"of keep {problem}"):
+        blamed(two, blamed_graphs.at(40, "scale/out"), graph)
 
 
 def test_the_state_that_an_operator_was_given_in_the_middle_is_on_the_chain(two: Path, tmp_path: Path) -> None:
@@ -143,8 +147,7 @@ def test_the_state_that_an_operator_was_given_in_the_middle_is_on_the_chain(two:
     begin, path = (k - 1) * blamed_graphs.STEP * 1e-9, tmp_path / "part.mcap"
     dataflow.replay(two, start=begin, record=path)
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(1, "scale/out"))).find()
+    chain = blamed(path, blamed_graphs.at(1, "scale/out"))
 
     (given,) = [link for link in chain.links if not link.input]
     assert given.call == ("keep", 0)
@@ -153,26 +156,21 @@ def test_the_state_that_an_operator_was_given_in_the_middle_is_on_the_chain(two:
 
 
 def test_where_the_search_among_earlier_calls_ended_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    dataflow.run(blamed_graphs.graph_of("mean | Mean | x: src/a"), record=path)
+    path = ran(tmp_path / "run.mcap", "mean | Mean | x: src/a")
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(40, "mean/out"))).find()
+    chain = blamed(path, blamed_graphs.at(40, "mean/out"))
 
     assert chain.ended == {"mean": 37}
     assert sensed(chain) == {("a", 38), ("a", 39), ("a", 40)}
 
 
-def test_two_inputs_that_each_suffice_are_named_together_and_the_readings_behind_them(tmp_path: Path) -> None:
+def test_two_sufficient_inputs_are_named_with_their_readings(tmp_path: Path) -> None:
     a, b, c = ([blamed_graphs.reading(0, s, k) for k in range(blamed_graphs.STEPS)] for s in "abc")
     large = [(x >= blamed_graphs.HALF, y / 2 + z / 2 >= blamed_graphs.HALF) for x, y, z in zip(a, b, c, strict=True)]
     k = next(k for k in range(2, len(large)) if all(large[k]) and not any(large[k - 1]))
-    path = tmp_path / "run.mcap"
-    graph = blamed_graphs.graph_of("sum | Add | x: src/b, y: src/c", "either | Either | x: src/a, y: sum/out")
-    dataflow.run(graph, record=path)
+    path = ran(tmp_path / "run.mcap", "sum | Add | x: src/b, y: src/c", "either | Either | x: src/a, y: sum/out")
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "either/out"))).find()
+    chain = blamed(path, blamed_graphs.at(k, "either/out"))
 
     inputs = {link.input: link for link in chain.links if link.call == ("either", k)}
     assert set(inputs) == {"x", "y"}
@@ -181,29 +179,24 @@ def test_two_inputs_that_each_suffice_are_named_together_and_the_readings_behind
     assert {number for _, number in sensed(chain)} == {k}
 
 
-def test_readings_of_two_sensors_that_each_suffice_are_named_behind_operators_between(tmp_path: Path) -> None:
+def test_two_sufficient_sensors_are_named_through_operators(tmp_path: Path) -> None:
     a, b = ([3.0 + blamed_graphs.reading(0, s, k) / 2 for k in range(blamed_graphs.STEPS)] for s in "ab")
     large = [(x >= blamed_graphs.LARGE, y >= blamed_graphs.LARGE) for x, y in zip(a, b, strict=True)]
     k = next(k for k in range(2, len(large)) if all(large[k]) and not any(large[k - 1]))
-    path = tmp_path / "run.mcap"
     either = f"either | Either | x: one/out, y: two/out | params: {{at: {blamed_graphs.LARGE}}}"
-    graph = blamed_graphs.graph_of("one | Scale | x: src/a", "two | Scale | x: src/b", either)
-    dataflow.run(graph, record=path)
+    path = ran(tmp_path / "run.mcap", "one | Scale | x: src/a", "two | Scale | x: src/b", either)
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "either/out"))).find()
+    chain = blamed(path, blamed_graphs.at(k, "either/out"))
 
     assert sensed(chain) == {("a", k), ("b", k)}
     assert chain.whole
 
 
 def test_of_a_batch_the_message_that_decided_is_named(tmp_path: Path) -> None:
-    path, k = tmp_path / "run.mcap", 4 * blamed_graphs.SLOW - 1
-    dataflow.run(blamed_graphs.graph_of("largest | Largest | x: src/a, t: src/slow"), record=path)
+    path, k = ran(tmp_path / "run.mcap", "largest | Largest | x: src/a, t: src/slow"), 4 * blamed_graphs.SLOW - 1
     readings = {n: blamed_graphs.reading(0, "a", n) for n in range(k + 1 - blamed_graphs.SLOW, k + 1)}
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "largest/out"))).find()
+    chain = blamed(path, blamed_graphs.at(k, "largest/out"))
 
     assert chain.value == max(readings.values())
     own = [link for link in chain.sensed if any(effect.way == "nudged" for effect in link.effects)]
@@ -228,13 +221,8 @@ def test_a_state_has_forgotten_what_was_before_it_was_set_anew(two: Path) -> Non
 def test_clocks_of_machines_that_are_off_do_not_hide_a_cause(
     offset: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "run.mcap"
-    graph = blamed_graphs.graph_of(
-        "sum | Add | x: src/a, y: src/b",
-        "scale | Scale | x: sum/out",
-        "pick | Pick | x: scale/out, y: src/c, by: sum/out",
-    )
-    dataflow.run(graph, record=path)
+    pick = "pick | Pick | x: scale/out, y: src/c, by: sum/out"
+    path = ran(tmp_path / "run.mcap", "sum | Add | x: src/a, y: src/b", "scale | Scale | x: sum/out", pick)
     ordered = FiringLog.ordered
 
     def shifted(log: FiringLog, node: Node) -> Iterator[FiringRecord]:
@@ -248,14 +236,13 @@ def test_clocks_of_machines_that_are_off_do_not_hide_a_cause(
     ]
     k = next(k for k in range(20, blamed_graphs.STEPS) if picked[k])
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(k, "pick/out"))).find()
+    chain = blamed(path, blamed_graphs.at(k, "pick/out"))
 
     nudges = {link.message[0] for link in chain.sensed if link.message for e in link.effects if e.way == "nudged"}
     assert nudges == {"blamed/src/a", "blamed/src/b"}
 
 
-def test_a_call_that_raised_in_the_run_too_hides_nothing_behind_it(tmp_path: Path) -> None:
+def test_call_that_raised_in_the_run_hides_nothing_behind_it(tmp_path: Path) -> None:
     live = "live: {restart: {max: 3, backoff: 0s}}"
     graph = blamed_graphs.graph_of(
         "mean | Mean | x: src/a",
@@ -278,22 +265,21 @@ def test_a_call_that_raised_in_the_run_too_hides_nothing_behind_it(tmp_path: Pat
     assert blamed_graphs.number(made["out"]) == 0.0, "the first call behind a restart begins anew"
 
 
-def test_a_state_that_was_brought_back_to_that_of_a_new_operator_leads_to_the_call_that_did(tmp_path: Path) -> None:
+def test_state_set_back_to_initial_leads_to_the_call_that_did(tmp_path: Path) -> None:
     readings = [blamed_graphs.reading(0, "a", k) for k in range(21)]
     assert [k for k, x in enumerate(readings) if x < blamed_graphs.LOW] == [8]
     assert [k for k, x in enumerate(readings) if x > blamed_graphs.HIGH] == [2, 11]
     graph = blamed_graphs.graph_of("latch | Latch | x: src/a")
     path = held_runs.recorded(graph, held_runs.Faults(), tmp_path / "run.mcap")
 
-    with Recording(path) as recording:
-        chain = Blame(recording, Field.parse(blamed_graphs.at(20, "latch/out"))).find()
+    chain = blamed(path, blamed_graphs.at(20, "latch/out"))
 
     assert chain.value == 1.0
     assert sensed(chain) == {("a", 11), ("a", 20)}, "call 20 would have closed it, with another reading"
     assert chain.whole
 
 
-def test_a_row_stands_before_or_behind_its_field_and_brackets_see_other_fields() -> None:
+def test_rows_and_masks_select_values_of_a_field() -> None:
     message = FeatureVector(stamp=5, vectors=np.arange(6, dtype=np.float32).reshape(3, 2), model="m")
 
     for path in ("[1].vectors[0]", ".vectors[1][0]", ".vectors[vectors[:, 1] == 3.0][0, 0]"):

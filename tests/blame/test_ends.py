@@ -59,9 +59,7 @@ def sensed(chain: Chain) -> list[int]:
 
 
 @pytest.mark.parametrize("step", [40, 59])  # behind it, a block of earlier calls ends among those that tripped it
-def test_a_latch_behind_a_low_pass_leads_to_the_one_reading_behind_all_calls_that_tripped_it(
-    step: int, spiky: Path
-) -> None:
+def test_latch_behind_low_pass_leads_to_the_reading_that_tripped_it(step: int, spiky: Path) -> None:
     chain = found(spiky, f"guard/stop.on@{step / 10}")
 
     assert sensed(chain) == [rangers.SPIKE]
@@ -92,7 +90,7 @@ def test_what_changes_a_value_most_is_named_first(spiky: Path) -> None:
     assert next(link.maker for link in chain.links if not link.input) == ("smooth", rangers.SPIKE)
 
 
-def test_a_value_that_nothing_changes_is_not_said_to_be_decided_by_nothing(spiky: Path) -> None:
+def test_value_that_no_change_reaches_has_no_cause(spiky: Path) -> None:
     asked = "brake/stop.on@3"
     told = CliRunner().invoke(app, ["blame", str(spiky), "--field", asked])
 
@@ -125,7 +123,7 @@ def test_changes_that_a_recorded_answer_does_not_fit_could_not_be_tried(spiky: P
     assert "changes made a call raise, which shows nothing" in words
 
 
-def test_outputs_of_nested_graphs_go_by_their_names_and_so_do_the_calls_behind_them(tmp_path: Path) -> None:
+def test_outputs_of_nested_graphs_go_by_their_names(tmp_path: Path) -> None:
     (tmp_path / "inner.yaml").write_text(
         "graph: inner\ninputs: {r: RangeReading}\noutputs: {smooth: filter/out}\n"
         'operators:\n  filter: {use: "rangers:Smooth", inputs: {range: r}}\n'
@@ -164,14 +162,14 @@ def test_readings_behind_calls_that_decide_together_are_tried_as_others(tmp_path
     assert chain.whole
 
 
-def test_a_time_behind_the_end_is_told(spiky: Path) -> None:
+def test_time_after_the_end_is_reported(spiky: Path) -> None:
     told = CliRunner().invoke(app, ["blame", str(spiky), "--field", "smooth/out.value@1000"])
 
     assert "made by smooth #59 at 5.900 s, the last one: the recording ends before" in " ".join(told.output.split())
     assert not found(spiky, "smooth/out.value@5.9").late
 
 
-def test_the_seconds_of_a_part_count_from_its_beginning_as_in_the_debugger(tmp_path: Path) -> None:
+def test_seconds_of_a_part_count_from_its_beginning(tmp_path: Path) -> None:
     path, part = tmp_path / "run.mcap", tmp_path / "part.mcap"
     dataflow.run(load_text("record: {snapshots: 500ms}\n" + GRAPH % "false"), record=path)
     cut = CliRunner().invoke(app, ["cut", str(path), "-o", str(part), "--from", "1.45", "--to", "3"])

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tampering import Kept, as_it_is, tampered
 
@@ -24,6 +25,9 @@ from dataflow.debugging.lines import homes_of, is_own, source_parts, stoppable_l
 from dataflow.messages.base import Message
 from dataflow.recording import Recorded, Recording
 from dataflow.sync import Firing
+
+Run = tuple[Recording, Path]
+"""A recording, and the source file of its operator."""
 
 SOURCE = '''
 from dataclasses import dataclass
@@ -89,8 +93,7 @@ class Client:
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         answer = self.request(command, **arguments)
         assert answer["success"], answer
-        body: dict[str, Any] = answer["body"]
-        return body
+        return dict(answer["body"])
 
     def request(self, command: str, **arguments: Any) -> dict[str, Any]:
         self._send(command, arguments)
@@ -125,6 +128,12 @@ class Client:
             self._note(message)
         return message["body"]["reason"], self.line()
 
+    def begin(self, *breakpoints: int, **more: str) -> tuple[str, int]:
+        """Sets breakpoints, says that all is set, and waits for the first stop."""
+        if breakpoints:
+            self.breakpoints(*breakpoints, **more)
+        return self.go("configurationDone")
+
     def go(self, command: str) -> tuple[str, int]:
         self.ask(command)
         return self.stopped()
@@ -133,8 +142,7 @@ class Client:
         return int(self.frames()[0]["line"])
 
     def frames(self) -> list[dict[str, Any]]:
-        frames: list[dict[str, Any]] = self.ask("stackTrace", threadId=1)["stackFrames"]
-        return frames
+        return list(self.ask("stackTrace", threadId=1)["stackFrames"])
 
     def call(self) -> int:
         return int(self.ask("threads")["threads"][0]["name"].split(" call ")[1].split()[0])
@@ -145,8 +153,7 @@ class Client:
         return {each["name"]: each["value"] for each in self.parts(scope)}
 
     def parts(self, reference: int) -> list[dict[str, Any]]:
-        parts: list[dict[str, Any]] = self.ask("variables", variablesReference=reference)["variables"]
-        return parts
+        return list(self.ask("variables", variablesReference=reference)["variables"])
 
     def value(self, expression: str, **more: Any) -> str:
         return str(self.ask("evaluate", expression=expression, frameId=1, **more)["result"])
@@ -157,16 +164,13 @@ class Client:
 
     def breakpoints(self, *lines: int, **more: str) -> list[dict[str, Any]]:
         wanted = [{"line": line, **more} for line in lines]
-        set_now: list[dict[str, Any]] = self.ask(
-            "setBreakpoints", source={"path": str(self._file)}, breakpoints=wanted
-        )["breakpoints"]
-        return set_now
+        told = self.ask("setBreakpoints", source={"path": str(self._file)}, breakpoints=wanted)
+        return list(told["breakpoints"])
 
     def _read(self) -> dict[str, Any]:
         length = int(self._stream.readline().split(b":")[1])
         self._stream.readline()
-        message: dict[str, Any] = json.loads(self._stream.read(length))
-        return message
+        return dict(json.loads(self._stream.read(length)))
 
     def _note(self, message: dict[str, Any]) -> None:
         if message["event"] == "output":
@@ -174,7 +178,7 @@ class Client:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Recording, Path]]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     folder = tmp_path_factory.mktemp("dap") / "site-packages"
     folder.mkdir()
     (folder / "stepped_adder.py").write_text(SOURCE)
@@ -189,7 +193,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Recordi
 
 
 @contextmanager
-def editing(recorded: tuple[Recording, Path], first: int = 0, **arguments: Any) -> Iterator[Client]:
+def editing(recorded: Run, first: int = 0, **arguments: Any) -> Iterator[Client]:
     """An editor that has said how it begins, and no breakpoints yet."""
     failures: list[BaseException] = []
     listening = listen(0)
@@ -253,7 +257,7 @@ def printed() -> list[tuple[int, int, dict[str, str]]]:
     return told
 
 
-def test_breakpoints_and_variables_are_those_of_a_run_with_prints(recorded: tuple[Recording, Path]) -> None:
+def test_breakpoints_and_variables_are_those_of_a_run_with_prints(recorded: Run) -> None:
     with editing(recorded, stopOnEntry=False) as client:
         assert [each["line"] for each in client.breakpoints(CLIPS, TOTAL)] == [CLIPS, TOTAL]
         client.ask("configurationDone")
@@ -268,14 +272,11 @@ def test_breakpoints_and_variables_are_those_of_a_run_with_prints(recorded: tupl
         assert "this was the last call; at its last line again" in client.told
 
 
-def test_steps_into_are_the_lines_of_a_run_with_prints_and_five_steps_back_undo_them(
-    recorded: tuple[Recording, Path],
-) -> None:
+def test_steps_forwards_and_back_are_the_lines_of_a_run_with_prints(recorded: Run) -> None:
     expected = printed()
     first = next(n for n, each in enumerate(expected) if each[0] == 7)
     with editing(recorded, first=7) as client:
-        client.ask("configurationDone")
-        assert client.stopped()[0] == "entry"
+        assert client.begin()[0] == "entry"
         seen = [client.seen()]
         for _ in range(16):
             client.go("stepIn")
@@ -289,19 +290,15 @@ def test_steps_into_are_the_lines_of_a_run_with_prints_and_five_steps_back_undo_
         assert client.seen() == expected[first + 12]
 
 
-def test_a_breakpoint_is_hit_in_a_later_call_after_a_step_back(recorded: tuple[Recording, Path]) -> None:
+def test_a_breakpoint_is_hit_in_a_later_call_after_a_step_back(recorded: Run) -> None:
     with editing(recorded, stopOnEntry=False) as client:
-        client.breakpoints(TOTAL)
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(TOTAL)
         client.go("stepBack")
         assert [client.go("continue") for _ in range(3)] == [("breakpoint", TOTAL)] * 3
         assert client.call() == 2
 
 
-def test_reverse_continue_goes_to_the_last_hit_of_this_call_then_of_earlier_ones(
-    recorded: tuple[Recording, Path],
-) -> None:
+def test_reverse_continue_goes_to_earlier_hits(recorded: Run) -> None:
     hits = [each for each in printed() if each[1] in (CLIPS, ADDED)]
     with editing(recorded, first=9, stopOnEntry=False) as client:
         client.breakpoints(CLIPS, ADDED)
@@ -317,12 +314,10 @@ def test_reverse_continue_goes_to_the_last_hit_of_this_call_then_of_earlier_ones
         assert client.seen() == printed()[0]
 
 
-def test_a_condition_stops_where_it_is_true_forwards_and_back(recorded: tuple[Recording, Path]) -> None:
+def test_a_condition_stops_where_it_is_true_forwards_and_back(recorded: Run) -> None:
     expected = [each for each in printed() if each[1] == ADDED and float(each[2]["value"]) > 60]
     with editing(recorded, stopOnEntry=False) as client:
-        client.breakpoints(ADDED, condition="value > 60")
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(ADDED, condition="value > 60")
         forwards = [client.seen()]
         for _ in range(2):
             client.go("continue")
@@ -334,12 +329,10 @@ def test_a_condition_stops_where_it_is_true_forwards_and_back(recorded: tuple[Re
 
 @pytest.mark.parametrize(("hits", "values"), [("2", [1.0, 4.0]), (">= 1", [0.0, 0.0, 1.0]), ("%2", [1.0, 4.0])])
 def test_a_hit_count_counts_the_passes_of_a_call_forwards_and_back(
-    recorded: tuple[Recording, Path], hits: str, values: list[float]
+    recorded: Run, hits: str, values: list[float]
 ) -> None:
     with editing(recorded, 0 if hits == ">= 1" else 1) as client:
-        client.breakpoints(ADDED, condition="value >= 0", hitCondition=hits)
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(ADDED, condition="value >= 0", hitCondition=hits)
 
         stops = [client.go("continue") and float(client.value("value")) for _ in values]
 
@@ -348,11 +341,9 @@ def test_a_hit_count_counts_the_passes_of_a_call_forwards_and_back(
         assert float(client.value("value")) == values[-2]
 
 
-def test_passes_are_counted_on_where_breakpoints_are_set_anew(recorded: tuple[Recording, Path]) -> None:
+def test_passes_are_counted_on_where_breakpoints_are_set_anew(recorded: Run) -> None:
     with editing(recorded, 1, stopOnEntry=False) as client:
-        client.breakpoints(ADDED, hitCondition="1")
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(ADDED, hitCondition="1")
         assert client.call() == 1
 
         client.breakpoints(ADDED, hitCondition="1")
@@ -361,19 +352,15 @@ def test_passes_are_counted_on_where_breakpoints_are_set_anew(recorded: tuple[Re
         assert client.call() == 2
 
 
-def test_a_condition_that_raises_is_said_once(recorded: tuple[Recording, Path]) -> None:
+def test_condition_that_raises_is_reported_once(recorded: Run) -> None:
     with editing(recorded, 1, stopOnEntry=False) as client:
-        client.breakpoints(ADDED, condition="nothing > 1", hitCondition="1")
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(ADDED, condition="nothing > 1", hitCondition="1")
         assert sum("raises NameError" in text for text in client.told) == 1
 
 
-def test_a_log_point_prints_once_and_does_not_stop(recorded: tuple[Recording, Path]) -> None:
+def test_a_log_point_prints_once_and_does_not_stop(recorded: Run) -> None:
     with editing(recorded, 2) as client:
-        client.breakpoints(ADDED, condition="value > 2", logMessage='adds {value:.2f} to "{added}"')
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(ADDED, condition="value > 2", logMessage='adds {value:.2f} to "{added}"')
         assert client.go("stepOut") == ("entry", FIRST)  # of the next call
         assert client.go("stepBack")[0] == "step"
         assert [text for text in client.told if text.startswith("adds")] == ['adds 4.00 to "2.0"']
@@ -381,10 +368,9 @@ def test_a_log_point_prints_once_and_does_not_stop(recorded: tuple[Recording, Pa
         assert client.call() == 0
 
 
-def test_steps_over_and_out_stay_in_the_frame_and_leave_it(recorded: tuple[Recording, Path]) -> None:
+def test_steps_over_and_out_stay_in_the_frame_and_leave_it(recorded: Run) -> None:
     with editing(recorded, first=3) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         over = [client.go("next")[1] for _ in range(8)]
         loop = LINES["for value in x.vectors[0].tolist():"]
         assert over == [loop, ADDED, loop, ADDED, loop, TOTAL, TOTAL + 1, LINES["added = 0.0"]]
@@ -397,10 +383,9 @@ def test_steps_over_and_out_stay_in_the_frame_and_leave_it(recorded: tuple[Recor
         assert client.seen()[2] == {"added": "4.0", "value": "4.0"}
 
 
-def test_values_are_opened_and_expressions_evaluated(recorded: tuple[Recording, Path]) -> None:
+def test_values_are_opened_and_expressions_evaluated(recorded: Run) -> None:
     with editing(recorded, first=5) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         assert client.value("float(x.vectors[0, 1])") == "25.0"
         assert client.value("self.state.total") == str(float(sum(k + k * k for k in range(5))))
         told = client.ask("evaluate", expression="self.state", frameId=1)
@@ -418,20 +403,17 @@ def test_values_are_opened_and_expressions_evaluated(recorded: tuple[Recording, 
 
 
 @pytest.mark.parametrize("text", ["foo bar", "left = nothing_such", "raise SystemExit", "raise OSError(2, 'no')"])
-def test_an_error_typed_in_the_console_leaves_the_call_where_it_is(recorded: tuple[Recording, Path], text: str) -> None:
+def test_console_error_leaves_the_call_where_it_is(recorded: Run, text: str) -> None:
     with editing(recorded, first=5) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         assert not client.request("evaluate", expression=text, context="repl", frameId=1)["success"]
         assert client.line() == LINES["added = 0.0"]
         assert client.go("next") == ("step", LINES["for value in x.vectors[0].tolist():"])
 
 
-def test_variables_that_are_assigned_by_hand_are_those_of_the_frame(recorded: tuple[Recording, Path]) -> None:
+def test_assigned_variables_are_those_of_the_frame(recorded: Run) -> None:
     with editing(recorded, first=5, stopOnEntry=False) as client:
-        client.breakpoints(LINES["if value > most:"])
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin(LINES["if value > most:"])
         client.value("value = 40.0", context="repl")
         client.ask("evaluate", expression="value = 7.0", context="repl", frameId=2)
         assert client.variables()["value"] == "40.0"
@@ -441,7 +423,7 @@ def test_variables_that_are_assigned_by_hand_are_those_of_the_frame(recorded: tu
         assert client.seen()[2] == {"added": "40.0", "value": "7.0"}
 
 
-def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) -> None:
+def test_breakpoint_that_cannot_be_set_has_a_reason(recorded: Run) -> None:
     with editing(recorded) as client:
         doc = LINES['"""Adds up."""']
         for before in (doc + 1, LINES["class Adder(Operator):"]):
@@ -450,14 +432,13 @@ def test_a_breakpoint_that_cannot_be_says_why(recorded: tuple[Recording, Path]) 
         assert client.breakpoints(LINES["def clipped(value, most):"]) == [{"verified": True, "line": CLIPS - 1}]
         (beyond,) = client.breakpoints(4000)
         assert not beyond["verified"]
-        told = client.ask("setBreakpoints", source={"path": np_file()}, breakpoints=[{"line": 1}])
+        told = client.ask("setBreakpoints", source={"path": np.__file__}, breakpoints=[{"line": 1}])
         assert "not for libraries" in told["breakpoints"][0]["message"]
         for more in ({"condition": "value >"}, {"hitCondition": "often"}, {"hitCondition": "0"}, {"logMessage": "{"}):
             (wrong,) = client.breakpoints(ADDED, **more)
             assert not wrong["verified"]
             assert next(iter(more.values())) in wrong["message"]
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
 
 
 BEGUN = """LIMIT = 3
@@ -496,29 +477,9 @@ def test_breakpoints_are_for_lines_that_calls_run(tmp_path: Path, wanted: int, l
         stoppable_line(str(file), wanted, "Robot.setup")
 
 
-def np_file() -> str:
-    import numpy
-
-    return str(numpy.__file__)
-
-
-def test_a_change_of_state_by_hand_is_told_when_the_call_is_made(recorded: tuple[Recording, Path]) -> None:
+def test_state_changed_by_hand_is_reported_and_does_not_reach_the_next_call(recorded: Run) -> None:
     with editing(recorded, first=2) as client:
-        client.ask("configurationDone")
-        client.stopped()
-        client.value("setattr(self.state, 'total', 7.0)", context="repl")
-        client.breakpoints(TOTAL)
-        client.go("continue")
-        client.go("continue")
-        assert client.told[-1] == "call 2: not as recorded, differs in total"
-
-
-def test_the_call_behind_one_whose_state_was_changed_by_hand_has_the_recorded_state(
-    recorded: tuple[Recording, Path],
-) -> None:
-    with editing(recorded, first=2) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         client.value("setattr(self.state, 'total', 7.0)", context="repl")
         client.breakpoints(TOTAL)
         client.go("continue")
@@ -531,27 +492,25 @@ def test_the_call_behind_one_whose_state_was_changed_by_hand_has_the_recorded_st
         ]
 
 
-def test_a_pause_is_noticed_between_calls_of_few_lines_forwards_and_back(recorded: tuple[Recording, Path]) -> None:
+def test_pause_is_noticed_between_calls_forwards_and_back(recorded: Run) -> None:
     with editing(recorded, stopOnEntry=False) as client:
         assert client.at_once("configurationDone", "pause")[0] == "pause"
         assert client.call() == 0
     with editing(recorded, first=11) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         assert client.at_once("reverseContinue", "pause")[0] == "pause"
 
 
-def test_a_pause_ends_a_way_to_a_call_far_away(recorded: tuple[Recording, Path]) -> None:
+def test_a_pause_ends_a_way_to_a_call_far_away(recorded: Run) -> None:
     with editing(recorded) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         goto = {"expression": "goto 11", "context": "repl", "frameId": 1}
         assert client.at_once("evaluate", "pause", **goto)[0] == "pause"
         assert client.call() < 11
 
 
-def test_a_pause_stops_where_the_way_was_even_if_little_of_it_is_kept(
-    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+def test_pause_on_the_way_stops_there_even_if_few_calls_are_kept(
+    recorded: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look = Session._look_on_the_way
 
@@ -562,19 +521,15 @@ def test_a_pause_stops_where_the_way_was_even_if_little_of_it_is_kept(
     monkeypatch.setattr("dataflow.debugging.ring.MOST_CALLS", 2)
     monkeypatch.setattr(Session, "_look_on_the_way", paused)
     with editing(recorded) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         client.value("goto 11", context="repl")
         assert client.stopped()[0] == "pause"
         assert client.call() == 7
 
 
-def test_a_pause_behind_the_last_call_stops_too(
-    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pause_behind_the_last_call_stops_too(recorded: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     with editing(recorded, first=11) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
 
         def broken_off(session: Session, *_: object) -> None:
             monkeypatch.undo()
@@ -589,7 +544,7 @@ def test_a_pause_behind_the_last_call_stops_too(
 
 
 def test_calls_are_made_once_on_the_way_and_twice_back_to_the_beginning(
-    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
+    recorded: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
     process = Probe.process
@@ -610,15 +565,14 @@ def test_calls_are_made_once_on_the_way_and_twice_back_to_the_beginning(
         assert len(made) == 12
     made.clear()
     with editing(recorded, first=11) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         assert len(made) == 12
         client.breakpoints()
         assert client.go("reverseContinue") == ("entry", LINES["added = 0.0"])
         assert len(made) < 12 + 2 * 12 + 4
 
 
-def test_source_is_the_operators_own_wherever_its_package_is_installed(recorded: tuple[Recording, Path]) -> None:
+def test_source_of_installed_package_is_the_operators_own(recorded: Run) -> None:
     """The operator of this file lies among installed packages."""
     engine, installed = Path(dataflow.__file__).resolve().parent, recorded[1].resolve()
     assert homes_of("stepped_adder") == (installed,)
@@ -629,11 +583,10 @@ def test_source_is_the_operators_own_wherever_its_package_is_installed(recorded:
     assert not is_own(str(engine / "operator.py"), (engine,))
 
 
-def test_restart_takes_over_edited_source(recorded: tuple[Recording, Path]) -> None:
+def test_restart_takes_over_edited_source(recorded: Run) -> None:
     file = recorded[1]
     with editing(recorded, first=6) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         try:
             file.write_text(SOURCE.replace("added = 0.0", "added = 0.5"))
             assert client.go("restart")[0] == "entry"
@@ -648,7 +601,7 @@ def test_restart_takes_over_edited_source(recorded: tuple[Recording, Path]) -> N
 
 
 @pytest.mark.parametrize("head", ["GET / HTTP/1.1\r\nHost: here", "POST /a:b HTTP/1.1\r\nContent-Length: %d"])
-def test_what_is_no_message_of_the_protocol_ends_the_session(recorded: tuple[Recording, Path], head: str) -> None:
+def test_other_protocols_end_the_session(recorded: Run, head: str) -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         body = json.dumps({"seq": 1, "type": "request", "command": "configurationDone"})
@@ -660,9 +613,7 @@ def test_what_is_no_message_of_the_protocol_ends_the_session(recorded: tuple[Rec
         assert not select.select([theirs], [], [], 0)[0]  # nothing was answered
 
 
-def test_a_client_that_sends_nothing_ends_the_session(
-    recorded: tuple[Recording, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_sends_nothing_ends_the_session(recorded: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.debugging.dap.session.GREETS", 0.01)
     ours, theirs = socket.socketpair()
     with ours, theirs:
@@ -671,38 +622,51 @@ def test_a_client_that_sends_nothing_ends_the_session(
         assert session._over
 
 
-def test_a_line_behind_the_end_of_the_file_names_the_last_one(recorded: tuple[Recording, Path]) -> None:
+def test_a_line_behind_the_end_of_the_file_names_the_last_one(recorded: Run) -> None:
     with editing(recorded) as client:
         (told,) = client.breakpoints(100_000)
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
     assert not told["verified"]
     last = max(line for part in source_parts(str(recorded[1])) for line in part.lines)
     assert told["message"] == f"no code from line 100000 on: the last line with code is {last}"
 
 
-def test_what_is_no_message_ends_the_session_and_no_call_is_blamed(recorded: tuple[Recording, Path]) -> None:
+@contextmanager
+def serving(recording: Recording, file: Path, first: int) -> Iterator[tuple[Client, socket.socket, list[DebugError]]]:
+    """A session that has begun, which the block has to bring to an end; its socket, and the errors that it raises."""
     ours, theirs = socket.socketpair()
-    debugger = Debugger(recorded[0], "adder")
+    debugger, failures = Debugger(recording, "adder"), list[DebugError]()
+
+    def serve() -> None:
+        try:
+            Session(ours, debugger, first).serve()
+        except DebugError as error:
+            failures.append(error)
+
     with ours, theirs:
-        client = Client(theirs, recorded[1])
-        server = threading.Thread(target=Session(ours, debugger, 3).serve, daemon=True)
+        client = Client(theirs, file)
+        server = threading.Thread(target=serve, daemon=True)
         server.start()
         for command in ("initialize", "launch", "configurationDone"):
             client.ask(command)
-        client.stopped()
-        theirs.sendall(b"Content-Length: 5\r\n\r\nhello")
+        yield client, theirs, failures
         while (message := client._read())["event"] != "terminated":
             client._note(message)
         server.join(60)
     debugger.close()
     assert not server.is_alive()
+
+
+def test_malformed_message_ends_session_without_a_verdict_on_the_call(recorded: Run) -> None:
+    with serving(*recorded, 3) as (client, theirs, _):
+        client.stopped()
+        theirs.sendall(b"Content-Length: 5\r\n\r\nhello")
     assert [text for text in client.told if "not as recorded" in text] == []
     assert "the session ends: no message of the Debug Adapter Protocol" in client.told[-1]
 
 
 @pytest.fixture(scope="module")
-def torn(recorded: tuple[Recording, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
+def torn(recorded: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
     """The recording without what the calls from 9 on were given."""
 
     def before_the_end(found: Recorded) -> Kept:
@@ -713,46 +677,24 @@ def torn(recorded: tuple[Recording, Path], tmp_path_factory: pytest.TempPathFact
         yield recording
 
 
-def test_running_on_to_a_call_that_cannot_be_made_stops_at_the_last_line_before(
-    recorded: tuple[Recording, Path], torn: Recording
-) -> None:
+def test_running_on_stops_before_a_call_that_cannot_be_made(recorded: Run, torn: Recording) -> None:
     with editing((torn, recorded[1]), 7, stopOnEntry=False) as client:
-        client.ask("configurationDone")
-        assert client.stopped()[0] == "end of the recording"
+        assert client.begin()[0] == "end of the recording"
         assert client.call() == 8
         assert any("call 9 of adder cannot be made again: graph/numbers/x #9 is not recorded" in t for t in client.told)
         assert client.go("stepBack")[0] == "step"
         assert client.call() == 8
 
 
-def test_a_first_call_that_cannot_be_made_is_said_and_ends_the_session(
-    recorded: tuple[Recording, Path], torn: Recording
-) -> None:
-    ours, theirs = socket.socketpair()
-    debugger, failures = Debugger(torn, "adder"), list[BaseException]()
-
-    def serve() -> None:
-        try:
-            Session(ours, debugger, 10).serve()
-        except DebugError as error:
-            failures.append(error)
-
-    with ours, theirs:
-        client = Client(theirs, recorded[1])
-        server = threading.Thread(target=serve, daemon=True)
-        server.start()
-        for command in ("initialize", "launch", "configurationDone"):
-            client.ask(command)
-        while (message := client._read())["event"] != "terminated":
-            client._note(message)
-        server.join(60)
-    debugger.close()
+def test_first_call_that_cannot_be_made_ends_session_with_the_reason(recorded: Run, torn: Recording) -> None:
+    with serving(torn, recorded[1], 10) as (client, _, failures):
+        pass
     assert "call 10 of adder cannot be made again" in client.told[-1]
     assert len(failures) == 1
 
 
 @pytest.fixture
-def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
+def edited(recorded: Run) -> Iterator[Path]:
     """The file of the operator, which may be edited."""
     yield recorded[1]
     recorded[1].write_text(SOURCE)
@@ -760,13 +702,10 @@ def edited(recorded: tuple[Recording, Path]) -> Iterator[Path]:
     exec(compile(SOURCE, str(recorded[1]), "exec"), vars(module))
 
 
-def test_a_call_that_raises_is_stopped_at_where_it_raises_once_on_each_way_there(
-    recorded: tuple[Recording, Path], edited: Path
-) -> None:
+def test_call_that_raises_stops_once_at_the_raising_line(recorded: Run, edited: Path) -> None:
     with editing(recorded, 5) as client:
         assert client.ask("setExceptionBreakpoints", filters=["uncaught"]) == {}
-        client.ask("configurationDone")
-        assert client.stopped()[0] == "entry"
+        assert client.begin()[0] == "entry"
         raises = "value = most if most != value - 14 else [][7]"
         edited.write_text(SOURCE.replace("value = most\n", f"{raises}\n"))
         client.go("restart")
@@ -781,12 +720,9 @@ def test_a_call_that_raises_is_stopped_at_where_it_raises_once_on_each_way_there
         assert any("IndexError: list index out of range" in text for text in client.told)
 
 
-def test_a_call_with_other_lines_each_time_is_stopped_at_in_the_end(
-    recorded: tuple[Recording, Path], edited: Path
-) -> None:
+def test_call_with_other_lines_each_time_stops_in_the_end(recorded: Run, edited: Path) -> None:
     with editing(recorded, 11) as client:
-        client.ask("configurationDone")
-        client.stopped()
+        client.begin()
         less = (
             "LEFT = [90]\n\n\ndef clipped(value, most):\n    LEFT[0] -= 1\n    for _ in range(LEFT[0]):\n        pass\n"
         )

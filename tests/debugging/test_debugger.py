@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import random
 import sys
@@ -88,20 +87,16 @@ def test_all_calls_are_as_recorded_forwards_and_in_any_order(kept: Recording, op
     assert all(fired.same for fired in forwards)
     order = random.Random(3).sample(range(len(debugger.calls)), 8)
     for number in order:
-        again = debugger.goto(number)
-        assert (again.call, again.before, again.after) == (
-            forwards[number].call,
-            forwards[number].before,
-            forwards[number].after,
-        )
-        assert [m.here.digest() for m in again.made if m.here] == [
-            m.here.digest() for m in forwards[number].made if m.here
-        ]
+        assert shown(debugger.goto(number)) == shown(forwards[number])
     debugger.close()
 
 
+def shown(fired: Fired) -> tuple[Any, ...]:
+    return fired.call, fired.before, fired.after, [m.here.digest() for m in fired.made if m.here]
+
+
 @pytest.mark.parametrize("operator", ["smooth", "tally"])
-def test_a_state_goes_over_to_the_next_call_of_an_incarnation(kept: Recording, operator: str) -> None:
+def test_state_after_a_call_is_that_before_the_next(kept: Recording, operator: str) -> None:
     debugger = Debugger(kept, operator)
     before = debugger.goto(0)
     for number in range(1, len(debugger.calls)):
@@ -111,7 +106,7 @@ def test_a_state_goes_over_to_the_next_call_of_an_incarnation(kept: Recording, o
         before = fired
 
 
-def test_nothing_goes_on_from_a_call_that_was_made_otherwise(kept: Recording) -> None:
+def test_no_call_continues_from_one_that_was_made_otherwise(kept: Recording) -> None:
     debugger = Debugger(kept, "smooth")
     debugger.goto(1)
 
@@ -137,7 +132,7 @@ def test_a_call_is_found_by_its_time(kept: Recording) -> None:
     assert debugger.goto(-1).number == len(debugger.calls) - 1
 
 
-def test_what_is_not_there_is_named(kept: Recording) -> None:
+def test_unknown_operators_and_calls_are_named(kept: Recording) -> None:
     with pytest.raises(DebugError, match="'none' are recorded; there are: busy, look, smooth, tally"):
         Debugger(kept, "none")
     with pytest.raises(DebugError, match="'robot' is a source"):
@@ -159,13 +154,16 @@ RIGHT = "self.state.total += float(x.vectors[0, 0])"
 
 
 @pytest.fixture
-def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recording]:
+def added(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recording]:
+    """A recorded run of the adder; the parameter is a line more of its graph."""
     written(tmp_path, RIGHT)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
-    module = importlib.import_module("debugged_adder")
-    graph = dataflow.Graph().add("numbers", module.Numbers).add("adder", module.Adder)
-    graph.connect("adder", x="numbers/x").run(record=tmp_path / "run.mcap")
+    graph = load_text(
+        f"graph: graph\n{getattr(request, 'param', '')}\noperators:\n  numbers: {{use: 'debugged_adder:Numbers'}}\n"
+        "  adder: {use: 'debugged_adder:Adder', inputs: {x: numbers/x}}\n"
+    )
+    dataflow.run(graph, record=tmp_path / "run.mcap")
     with Recording(tmp_path / "run.mcap") as recording:
         yield recording
     monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
@@ -188,7 +186,7 @@ def test_going_back_begins_from_a_state_on_the_way(added: Recording, monkeypatch
     assert debugger.at.changed() == ("total",)
 
 
-def test_the_last_calls_are_gone_back_to_without_making_one(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_going_back_to_kept_calls_makes_none(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(25)
     made = list[int]()
@@ -231,9 +229,7 @@ def test_the_kept_calls_are_bounded_by_their_bytes(added: Recording) -> None:
         assert [n for n in range(26) if debugger._ring.get(n)] == kept
 
 
-def test_states_are_recorded_by_cpu_time_where_a_graph_asks_for_it(
-    added: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_snapshots_by_cpu_time_are_used(added: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = replace(graph_that_is_here(added)[0], record=Record(tuple(added.streams), snapshots="cpu"))
     assert Graph.from_json(json.loads(json.dumps(graph.to_json()))).record == graph.record
     for spacing, expected in ((0, 30), (10**12, 0)):
@@ -318,27 +314,12 @@ def test_edited_source_is_taken_over_and_compared_from_the_same_state(added: Rec
     assert debugger.first_difference() is None
 
 
-@pytest.fixture
-def with_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recording]:
-    """As `added`, with a state every 0.5 s."""
-    written(tmp_path, RIGHT)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
-    graph = load_text(
-        "graph: added\nrecord: {snapshots: 500ms}\noperators:\n  numbers: {use: 'debugged_adder:Numbers'}\n"
-        "  adder: {use: 'debugged_adder:Adder', inputs: {x: numbers/x}}\n"
-    )
-    dataflow.run(graph, record=tmp_path / "run.mcap")
-    with Recording(tmp_path / "run.mcap") as recording:
-        yield recording
-    monkeypatch.delitem(sys.modules, "debugged_adder", raising=False)
-
-
 COUNTS = RIGHT + "; self.state.calls += 1; self.state.total += (self.state.calls > 20)"
 
 
-def test_states_without_a_field_that_the_class_has_now_are_passed_by(with_states: Recording, tmp_path: Path) -> None:
-    debugger = Debugger(with_states, "adder")
+@pytest.mark.parametrize("added", ["record: {snapshots: 500ms}"], indirect=True)
+def test_recorded_states_that_lack_a_field_of_the_class_are_not_used(added: Recording, tmp_path: Path) -> None:
+    debugger = Debugger(added, "adder")
     assert debugger._recorded
     assert debugger.goto(25).same
     file = written(tmp_path, COUNTS)
@@ -357,7 +338,7 @@ def test_states_without_a_field_that_the_class_has_now_are_passed_by(with_states
     assert found is not None
     assert found.number == 20
     debugger.close()
-    fresh = Debugger(with_states, "adder")  # of the class as it is now
+    fresh = Debugger(added, "adder")  # of the class as it is now
     assert fresh.goto(25).states()[0] == {"total": sum(range(25)) + 5, "calls": 25}
 
 
@@ -384,7 +365,7 @@ def test_expressions_see_the_dicts_of_a_state(
     assert ("tracks", {0: 0.0, 1: 10.0}, {0: 0.0, 1: 10.0, 2: 20.0}) in [*at.changes()]
 
 
-def test_source_that_does_not_run_leaves_the_old_one(added: Recording, tmp_path: Path) -> None:
+def test_broken_source_leaves_the_old_one(added: Recording, tmp_path: Path) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(4)
     written(tmp_path, "self.state.total +=")
@@ -421,7 +402,7 @@ def torn(added: Recording, tmp_path: Path) -> Iterator[Recording]:
         yield recording
 
 
-def test_calls_that_cannot_be_made_are_counted_and_not_taken_for_as_recorded(torn: Recording) -> None:
+def test_calls_that_cannot_be_made_are_counted(torn: Recording) -> None:
     debugger = Debugger(torn, "adder")
     assert debugger.first_difference() is None
     lost = Unmade(len(debugger.calls) - 20, 20, "graph/numbers/x #20 is not recorded")
@@ -438,7 +419,7 @@ def test_calls_that_cannot_be_made_are_counted_and_not_taken_for_as_recorded(tor
         debugger.goto(25)
 
 
-def test_a_capture_does_not_call_what_could_not_be_made_as_recorded(torn: Recording) -> None:
+def test_capture_does_not_report_unmade_calls_as_recorded(torn: Recording) -> None:
     with pytest.raises(DebugError, match="adder: 20 calls as recorded, without an error; 11 calls could not be made"):
         capture(torn, Debugger(torn, "adder"))
 
@@ -484,21 +465,21 @@ def all_made(debugger: Debugger, first: int = 0, last: int | None = None) -> lis
     return found
 
 
-def test_the_prompt_says_what_could_not_be_made_and_fails(torn: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prompt_fails_and_names_calls_that_could_not_be_made(
+    torn: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
     shell = Shell(Debugger(torn, "adder"), 0)
+    lost = "11 calls could not be made again (the first is call 20: graph/numbers/x #20"
     for line, told in (
-        (
-            "diff",
-            "error: 20 calls as recorded; 11 calls could not be made again (the first is call 20: graph/numbers/x #20",
-        ),
-        ("until False", "error: no call after this one that can be made is so: False; 11 calls could not be made"),
+        ("diff", "20 calls as recorded"),
+        ("until False", "no call after this one that can be made is so: False"),
     ):
         shell.onecmd(line)
         assert shell.failed
-        assert told in capsys.readouterr().out
+        assert f"error: {told}; {lost}" in capsys.readouterr().out
 
 
-def test_what_a_search_passes_by_is_said_with_what_it_finds(
+def test_search_reports_calls_that_it_could_not_make(
     torn: Recording, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     debugger = Debugger(torn, "adder")
@@ -524,7 +505,7 @@ def test_the_prompt_goes_to_a_call_as_the_command_line_names_it(added: Recording
             shell.number(word)
 
 
-def test_an_operator_that_declares_no_state_may_have_one(added: Recording, tmp_path: Path) -> None:
+def test_missing_state_is_explained(added: Recording, tmp_path: Path) -> None:
     debugger = Debugger(added, "adder")
     assert "adder declares no state, so what it keeps in attributes is not seen" in debugger.no_state()
     debugger.node.operator.stateless = True
@@ -534,7 +515,7 @@ def test_an_operator_that_declares_no_state_may_have_one(added: Recording, tmp_p
         debugger.node.operator.stateless = False
 
 
-def test_a_recording_without_calls_names_what_would_have_some(repository: Path) -> None:
+def test_recording_of_sources_alone_is_refused(repository: Path) -> None:
     with (
         Recording(repository / "recordings" / "demo.mcap") as recording,
         pytest.raises(DebugError, match="nor of any other operator: the recording holds what sources gave"),
@@ -542,9 +523,7 @@ def test_a_recording_without_calls_names_what_would_have_some(repository: Path) 
         Debugger(recording, "odometry")
 
 
-def test_an_expression_is_not_true_of_a_call_without_what_it_names(
-    added: Recording, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_expression_is_false_of_calls_without_its_inputs(added: Recording, capsys: pytest.CaptureFixture[str]) -> None:
     shell = Shell(Debugger(added, "adder"), 0)
 
     shell.onecmd("until inp.x.stamp < 0")  # the last call is finish(), which is given nothing
@@ -571,7 +550,7 @@ def test_an_expression_is_not_true_of_a_call_without_what_it_names(
         (1, "[][0]", False),
     ],
 )
-def test_an_expression_lacks_what_a_call_was_not_given(
+def test_error_of_expression_by_missing_input_is_recognised(
     given: Any, expression: str, lacks: bool, added: Recording
 ) -> None:
     fired = replace(Debugger(added, "adder").goto(2), inputs={"x": given})
@@ -581,7 +560,7 @@ def test_an_expression_lacks_what_a_call_was_not_given(
     assert fired.lacks_for(caught.value) == lacks
 
 
-def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
+def test_expression_that_fits_no_call_is_an_error(
     added: Recording, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shell = Shell(debugger := Debugger(added, "adder"), 0, json=True)
@@ -594,12 +573,9 @@ def test_an_expression_that_could_be_tried_in_no_call_is_an_error(
     shell.onecmd("until inp.x is not None and inp.x.stamp > 0 or number == 3 and out.total.vectors is None")
     told = capsys.readouterr()
     assert "no call after this one is so" in told.out
-    shell.onecmd("until number > 3 and inp.x.stamp < 0")
+    shell.onecmd(f"until {(condition := 'number > 3 and inp.x.stamp < 0')}")
     assert not shell.failed
-    assert (
-        "not so where there is nothing, in 26 calls: number > 3 and inp.x.stamp < 0 at call 4"
-        in capsys.readouterr().err
-    )
+    assert f"not so where there is nothing, in 26 calls: {condition} at call 4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -619,13 +595,12 @@ def test_names_are_completed_in_expressions(line: str, text: str, found: list[st
     assert shell.complete_until(text, line, len(line) - len(text), len(line)) == found
 
 
-def test_an_operator_that_was_not_called_has_no_call(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_operator_without_calls_is_refused(added: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     debugger = Debugger(added, "adder")
     monkeypatch.setattr(debugger, "calls", [])
-    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
-        debugger.goto(0)
-    with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
-        debugger.number_at(0)
+    for find in (debugger.goto, debugger.number_at):
+        with pytest.raises(DebugError, match=r"^adder was not called in this recording$"):
+            find(0)
 
 
 def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> None:
@@ -656,7 +631,7 @@ def test_setup_that_fails_is_tried_anew(added: Recording, tmp_path: Path) -> Non
     assert debugger.goto(5).same
 
 
-def test_other_operators_that_are_gone_do_not_matter() -> None:
+def test_missing_other_operators_are_no_error() -> None:
     with Recording(KEPT / "perception.mcap") as recording:
         debugger = Debugger(recording, "motion_check")
         assert debugger.goto(1).same

@@ -47,7 +47,7 @@ SHOWN_BY = {
         a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted
     """,
     "the whole run or its supervisor pauses (`docker pause`, a suspended laptop, heavy swapping)": """
-        a_pause_of_the_supervisor_and_others_kills_and_blames_nobody
+        pause_of_supervisor_and_others_kills_and_blames_no_process
         a_time_in_which_the_process_was_stopped_is_no_part_of_a_call
     """,
     "the process that starts the others (the nursery) is killed": """

@@ -103,7 +103,7 @@ def test_a_killed_process_does_nothing_more_and_a_frozen_one_goes_on_where_it_wa
     assert 8 <= seen["two"] <= 10
 
 
-def test_who_spins_is_named() -> None:
+def test_spinning_task_is_named() -> None:
     world = World(1, preempt=0.0)
 
     def spin() -> None:
@@ -115,7 +115,7 @@ def test_who_spins_is_named() -> None:
         world.run(lambda: False, 1000.0)
 
 
-def test_who_makes_up_for_the_ticks_of_the_longest_pause_does_not_spin() -> None:
+def test_ticks_of_the_longest_pause_are_fewer_than_the_calls_of_a_spin() -> None:
     assert round(LONGEST_PAUSE / TICK) * 10 <= MOST_CALLS
 
 
@@ -228,7 +228,7 @@ RESTARTED = "restart: {max: 5, backoff: 10ms}"
 )
 @pytest.mark.parametrize("target", ["*", "", "relay", "@recorder"])
 @pytest.mark.parametrize("span", [pytest.param(6.0, marks=pytest.mark.long), 40.0])
-def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
+def test_pause_of_supervisor_and_others_kills_and_blames_no_process(
     target: str, span: float, policy: str, memory: Path
 ) -> None:
     pause = (Happening(0.05, "pause", target, {"span": span}),)
@@ -241,10 +241,7 @@ def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
 
 
 def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memory: Path) -> None:
-    happenings = (
-        Happening(0.15, "pause", "", {"span": 6.0}),
-        Happening(0.15, "freeze", "relay", {"span": 12.0}),
-    )
+    happenings = (Happening(0.15, "pause", "", {"span": 6.0}), Happening(0.15, "freeze", "relay", {"span": 12.0}))
     plain = replace(PLAIN, live=True, policy=RESTARTED, count=12, period=20_000_000)
 
     result = check(replace(plain, happenings=happenings), memory)
@@ -310,7 +307,7 @@ def test_links_between_machines(first: int) -> None:
         travel(journey_of(seed))
 
 
-def test_two_machines_that_say_nothing_are_given_the_time_to_measure_their_clocks() -> None:
+def test_clocks_of_silent_machines_are_measured() -> None:
     """A beat and its answer take longer than a second here."""
     travel(journey_of(25_002_417))
 
@@ -356,10 +353,7 @@ FOUND_BY = {
     "pause": replace(
         PLAIN,
         live=True,
-        happenings=(
-            Happening(0.01, "pause", "*", {"span": 6.0}),
-            Happening(0.02, "set", "relay", {"gain": 2.0}),
-        ),
+        happenings=(Happening(0.01, "pause", "*", {"span": 6.0}), Happening(0.02, "set", "relay", {"gain": 2.0})),
     ),
 }
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""

@@ -45,18 +45,7 @@ READERS_OWN = {
 }
 """Names that stand for files of the reader."""
 PROGRAMS = (
-    "python",
-    "python3",
-    "pip",
-    "pytest",
-    "rerun",
-    "git",
-    "cd",
-    "mkdir",
-    "export",
-    "mkdocs",
-    "c++",
-    "bash",
+    *("python", "python3", "pip", "pytest", "rerun", "git", "cd", "mkdir", "export", "mkdocs", "c++", "bash"),
     "ls",
 )
 """What else a line of a `sh` block may begin with."""
@@ -368,16 +357,8 @@ def main(folder: Path, pages: list[str]) -> None:
     import dataflow.testing
     from dataflow.graph import load_graph
 
-    for name in (
-        "operators.cloud",
-        "operators.sources",
-        "pandas",
-        "scipy.ndimage",
-        "scipy.optimize",
-        "scipy.spatial",
-        "scipy.stats",
-        "rich.console",
-    ):
+    parts = (f"scipy.{part}" for part in ("ndimage", "optimize", "spatial", "stats"))
+    for name in ("operators.cloud", "operators.sources", "pandas", *parts, "rich.console"):
         importlib.import_module(name)  # once, before the pages' processes are forked
     load_graph(REPOSITORY / "graphs" / "perception.yaml")  # and its operators
 

@@ -17,17 +17,8 @@ Values = dict[str, Any]
 Rng = np.random.Generator
 
 WORDS = (
-    "lidar",
-    "base_link",
-    "Küche",
-    "cuisine d'été",
-    "機械",
-    "🤖",
-    'a "quoted" \\ word',
-    "two\nlines",
-    "e\u0301",
-    "a/b",
-    "",
+    *("lidar", "base_link", "Küche", "cuisine d'été", "機械", "🤖", 'a "quoted" \\ word', "two\nlines"),
+    *("e\u0301", "a/b", ""),
 )
 AWKWARD = (0x7FC00000, 0xFFC00123, 0x80000000, 0x00000001, 0x7F800000, 0xFF800000)
 """float32 bits: NaN, a negative NaN with a payload, -0.0, the smallest denormal, +inf, -inf."""
@@ -314,15 +305,17 @@ def _scene_graph(values: Values, rng: Rng) -> None:
 def _activity(values: Values, rng: Rng) -> None:
     _classes(values, rng)
     values["goals"] = _words(len(values["subjects"]), rng)
-    if values["probabilities"] is not None:
-        shape = (len(values["subjects"]), len(values["class_names"]))
-        values["probabilities"] = rng.random(shape).astype(np.float32)
+    _probabilities(values, rng, "subjects")
 
 
 def _classification(values: Values, rng: Rng) -> None:
     _classes(values, rng)
+    _probabilities(values, rng, "class_ids")
+
+
+def _probabilities(values: Values, rng: Rng, of: str) -> None:
     if values["probabilities"] is not None:
-        shape = (len(values["class_ids"]), len(values["class_names"]))
+        shape = (len(values[of]), len(values["class_names"]))
         values["probabilities"] = rng.random(shape).astype(np.float32)
 
 

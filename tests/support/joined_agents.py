@@ -27,19 +27,9 @@ class Robot:
 def join(name: str, connect: str, folder: Path, *words: str, code: Path = HERE) -> subprocess.Popen[str]:
     """Starts an agent, which finds operators in `code`; it is given relative paths, as users give them."""
     given = [os.path.relpath(word, folder.parent) if os.path.isabs(word) else word for word in words]
+    command = [sys.executable, "-m", "dataflow.cli.main", "join", name, "--connect", connect]
     return subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "dataflow.cli.main",
-            "join",
-            name,
-            "--connect",
-            connect,
-            "--folder",
-            folder.name,
-            *given,
-        ],
+        [*command, "--folder", folder.name, *given],
         env={**os.environ, "PYTHONPATH": str(code)},
         cwd=folder.parent,
         stdout=subprocess.PIPE,

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import tracemalloc
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from scipy.stats import binom, mannwhitneyu, wilcoxon
 
 from dataflow.sweep.paired import ALPHA, compared, least_p, needed, unlike
+
+if TYPE_CHECKING:
+    from scipy.stats import binom, mannwhitneyu, wilcoxon
 
 
 def worlds(rng: np.random.Generator, gain: float, count: int = 40) -> dict[str, tuple[float, float]]:

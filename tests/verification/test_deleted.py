@@ -39,12 +39,17 @@ def verdicts(report: VerifyReport) -> dict[str, str]:
     return {v.operator: v.verdict for v in report.operators}
 
 
-def recorded(folder: Path, record: str) -> Path:
-    """A recording of a graph of two modules, which are loaded as long as the test runs."""
-    for name in ("stays_here", "goes_away"):
-        (folder / f"{name}.py").write_text(MODULE)
+def write(folder: Path, **modules: str) -> None:
+    """Puts modules of these texts into a folder, where they were not loaded before."""
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(text)
         sys.modules.pop(name, None)
     importlib.invalidate_caches()
+
+
+def recorded(folder: Path, record: str) -> Path:
+    """A recording of a graph of two modules, which are loaded as long as the test runs."""
+    write(folder, stays_here=MODULE, goes_away=MODULE)
     graph = load_text(f"""
 graph: test
 record: {{topics: ["{record}"]}}
@@ -74,11 +79,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.long
-def test_a_class_that_is_gone_is_named_and_the_rest_is_identical(folder: Path) -> None:
+def test_deleted_class_is_named_and_the_rest_is_identical(folder: Path) -> None:
     path = recorded(folder, "**")
-    (folder / "goes_away.py").write_text(MODULE.replace("class Same", "class Renamed"))
-    del sys.modules["goes_away"]
-    importlib.invalidate_caches()
+    write(folder, goes_away=MODULE.replace("class Same", "class Renamed"))
 
     report = verify(path)
 
@@ -87,7 +90,7 @@ def test_a_class_that_is_gone_is_named_and_the_rest_is_identical(folder: Path) -
     assert not report.identical
 
 
-def test_the_command_names_it_and_ends_with_2(folder: Path) -> None:
+def test_command_names_deleted_module_and_exits_with_2(folder: Path) -> None:
     path = recorded(folder, "**")
     delete(folder / "goes_away.py")
 
@@ -99,7 +102,7 @@ def test_the_command_names_it_and_ends_with_2(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_it_cannot_be_verified_alone(folder: Path) -> None:
+def test_deleted_operator_cannot_be_verified_alone(folder: Path) -> None:
     path = recorded(folder, "**")
     delete(folder / "goes_away.py")
 
@@ -108,7 +111,7 @@ def test_it_cannot_be_verified_alone(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_takes_messages_of_it_that_were_not_recorded_cannot_be_verified(folder: Path) -> None:
+def test_consumer_of_unrecorded_messages_of_deleted_operator_is_unverifiable(folder: Path) -> None:
     path = recorded(folder, "src/**")
     delete(folder / "goes_away.py")
 
@@ -119,26 +122,20 @@ def test_what_takes_messages_of_it_that_were_not_recorded_cannot_be_verified(fol
     assert next(v for v in report.operators if v.operator == "after").missing == "test/away/out"
 
 
-def test_a_module_that_is_here_and_fails_to_import_is_an_error(folder: Path) -> None:
+def test_module_that_fails_to_import_is_an_error(folder: Path) -> None:
     path = recorded(folder, "**")
     delete(folder / "goes_away.py")
-    (folder / "goes_away.py").write_text("raise RuntimeError('half written')")
-    importlib.invalidate_caches()
+    write(folder, goes_away="raise RuntimeError('half written')")
 
     with pytest.raises(GraphError, match="half written"):
         verify(path)
 
 
 @pytest.mark.long
-def test_an_operator_that_lacks_a_parameter_of_then_is_named_and_the_rest_verified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    for name, more in (("stays_here", ""), ("changes", '\n    gain: float = Param(1.0, doc="gain")\n')):
-        text = MODULE.replace("Out, Source", "Out, Param, Source").replace("    x: In", f"{more}    x: In")
-        (tmp_path / f"{name}.py").write_text(text)
-        sys.modules.pop(name, None)
-    importlib.invalidate_caches()
+def test_operator_without_a_recorded_parameter_is_named_and_the_rest_verified(folder: Path) -> None:
+    gained = MODULE.replace("Out, Source", "Out, Param, Source")
+    gained = gained.replace("    x: In", '\n    gain: float = Param(1.0, doc="gain")\n    x: In')
+    write(folder, stays_here=MODULE, changes=gained)
     graph = load_text("""
 graph: test
 operators:
@@ -146,18 +143,16 @@ operators:
   less: {use: "changes:Same", params: {gain: 2.0}, inputs: {x: src/out}}
   after: {use: "stays_here:Same", inputs: {x: less/out}}
 """)
-    run(graph, placement="one_process", record=tmp_path / "run.mcap")
-    (tmp_path / "changes.py").write_text(MODULE)
-    sys.modules.pop("changes")
-    importlib.invalidate_caches()
+    run(graph, placement="one_process", record=folder / "run.mcap")
+    write(folder, changes=MODULE)
 
-    report = verify(tmp_path / "run.mcap")
+    report = verify(folder / "run.mcap")
 
     assert report.absent == {"less": "changes:Same has no parameter 'gain' any more"}
     assert verdicts(report) == {"after": "identical"}
 
 
-def test_where_no_operator_is_here_each_reason_is_given_once_with_its_operators(folder: Path) -> None:
+def test_each_missing_module_is_named_once_with_its_operators(folder: Path) -> None:
     path = recorded(folder, "**")
     delete(folder / "stays_here.py")
     delete(folder / "goes_away.py")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +12,14 @@ from hypothesis import strategies as st
 from tampering import tampered
 
 from dataflow.graph import Graph
-from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.supervision.core.report import Status
 from dataflow.verification.verify import verify
 from dataflow.verification.workers import slices
 from dataflow.verification.workers.slices import LEAST_NS, cut, shares
 
 PER_CALL = 50_000
-
-
-def with_look(kept: Path, use: str) -> Graph:
-    with Recording(kept) as recording:
-        graph = recorded_graph(recording)
-    return replace(graph, nodes={**graph.nodes, "look": replace(graph.nodes["look"], use=f"watched_operators:{use}")})
+WithClass = Callable[[str, str], Graph]
 
 
 def told(report: Any) -> dict[str, Any]:
@@ -98,12 +91,10 @@ def test_every_call_is_in_one_slice(calls: list[tuple[int, int]], amounts: list[
 
 
 @pytest.mark.long
-def test_a_divided_operator_gets_the_verdict_and_the_digests_of_one_that_is_not(
-    kept: Path, divided: list[dict[str, Any]]
+def test_divided_operator_gets_verdict_and_digests_of_undivided(
+    kept: Path, divided: list[dict[str, Any]], with_class: WithClass
 ) -> None:
-    graph = with_look(kept, "Alone")
-
-    seen: list[Status] = []
+    graph, seen = with_class("look", "Alone"), list[Status]()
 
     whole, parts = (verify(kept, graph=graph, jobs=jobs, watch=seen.append) for jobs in (1, 3))
 
@@ -116,10 +107,10 @@ def test_a_divided_operator_gets_the_verdict_and_the_digests_of_one_that_is_not(
 
 
 @pytest.mark.long
-def test_one_that_differs_is_named_with_its_first_difference_as_if_it_were_not_divided(
-    kept: Path, divided: list[dict[str, Any]]
+def test_first_difference_of_divided_operator_is_that_of_undivided(
+    kept: Path, divided: list[dict[str, Any]], with_class: WithClass
 ) -> None:
-    graph = with_look(kept, "Moody")
+    graph = with_class("look", "Moody")
 
     whole, parts = (verify(kept, graph=graph, jobs=jobs) for jobs in (1, 3))
 
@@ -129,15 +120,17 @@ def test_one_that_differs_is_named_with_its_first_difference_as_if_it_were_not_d
 
 
 @pytest.mark.long
-def test_one_with_a_state_that_it_denies_is_verified_as_a_whole(kept: Path, divided: list[dict[str, Any]]) -> None:
-    report = verify(kept, graph=with_look(kept, "Forgetful"), jobs=3)
+def test_operator_that_wrongly_declares_stateless_is_verified_as_a_whole(
+    kept: Path, divided: list[dict[str, Any]], with_class: WithClass
+) -> None:
+    report = verify(kept, graph=with_class("look", "Forgetful"), jobs=3)
 
     assert any(each["look"]["operator"]["first"] for each in divided if "look" in each)
     assert report.identical
 
 
-def test_what_makes_inputs_that_were_not_recorded_is_repeated_with_one_that_differs(
-    kept: Path, tmp_path: Path, divided: list[dict[str, Any]]
+def test_producer_of_unrecorded_inputs_is_repeated_with_differing_operator(
+    kept: Path, tmp_path: Path, divided: list[dict[str, Any]], with_class: WithClass
 ) -> None:
     thin = tampered(
         kept,
@@ -145,7 +138,7 @@ def test_what_makes_inputs_that_were_not_recorded_is_repeated_with_one_that_diff
         messages=lambda found: [] if found.stream == "kept/smooth/mean" else [(found.message, found.seq)],
     )
 
-    report = verify(thin, graph=with_look(kept, "Moody"), jobs=2)
+    report = verify(thin, graph=with_class("look", "Moody"), jobs=2)
 
     assert sum("look" in each for each in divided) > 1
     assert "look" in report.culprits

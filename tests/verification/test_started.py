@@ -29,13 +29,13 @@ def calls(*names: str, **request: object) -> list[Call]:
     return [Call(f"worker_functions:{name}", request, ("mix", "smooth")) for name in names]
 
 
-def test_they_answer_as_others_do_and_become_this_processs_own(early: EarlyWorkers) -> None:
+def test_early_workers_answer_and_become_children_of_this_process(early: EarlyWorkers) -> None:
     answers = call_workers(calls("describe", "describe", "describe", word="w"), threads=1, early=early)
 
     assert answers == [{"word": "w", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}] * 3
 
 
-def test_they_find_modules_of_folders_that_were_named_later(
+def test_early_workers_find_modules_of_folders_added_later(
     early: EarlyWorkers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "found_later.py").write_text("def found(request, board):\n    return request['x'] + 1\n")
@@ -45,14 +45,14 @@ def test_they_find_modules_of_folders_that_were_named_later(
     assert call_workers([Call("found_later:found", {"x": 1})], threads=1, early=early) == [2]
 
 
-def test_their_deaths_are_told_as_those_of_others(early: EarlyWorkers) -> None:
+def test_death_of_early_worker_is_reported(early: EarlyWorkers) -> None:
     with pytest.raises(RunFailed, match=r"operator 'smooth' ended its process with code 7 in close\(\)"):
         call_workers(calls("die", code=7, phase="close"), threads=1, early=early)
     with pytest.raises(RunFailed, match=r"operator 'smooth' was killed by SIGKILL"):
         call_workers(calls("die", code=-9, phase="setup"), threads=1, early=early)
 
 
-def test_those_that_nobody_takes_are_ended() -> None:
+def test_early_workers_that_are_not_taken_are_ended() -> None:
     before = children()
     for wait in (False, True):
         workers = EarlyWorkers(2)
@@ -65,7 +65,7 @@ def test_those_that_nobody_takes_are_ended() -> None:
         assert children() == before
 
 
-def test_a_single_one_that_waits_and_is_not_taken_is_ended() -> None:
+def test_single_early_worker_that_is_not_taken_is_ended() -> None:
     before = children()
     workers = EarlyWorkers(1)
     [worker] = workers._waiting
@@ -76,14 +76,14 @@ def test_a_single_one_that_waits_and_is_not_taken_is_ended() -> None:
     assert children() == before
 
 
-def test_a_graph_with_other_threads_gets_workers_of_its_own(early: EarlyWorkers) -> None:
+def test_other_number_of_threads_gets_other_workers(early: EarlyWorkers) -> None:
     assert early.take(3) is None
     (answer,) = call_workers(calls("describe", word="w"), threads=3, early=early)
 
     assert answer["OMP_NUM_THREADS"] == "3"
 
 
-def test_those_that_could_not_be_made_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_early_workers_that_fail_to_start_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     before = children()
     with monkeypatch.context() as patched:
         patched.setattr(sys, "executable", "/bin/false")

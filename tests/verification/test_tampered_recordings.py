@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from dataflow.messages import FeatureVector, Imu, Message
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.recorded_run import recorded_graph
-from dataflow.supervision.run import run
+from dataflow.supervision.run import replay, run
 from dataflow.verification.gate import Checked, check
 from dataflow.verification.verify import verify
 
@@ -65,7 +66,7 @@ def test_a_stored_output_that_was_changed_is_named_by_stream_and_number(
     assert one.culprits == ()
 
 
-def test_a_source_message_that_was_changed_is_named_and_nobody_is_blamed_for_it(kept: Path, tmp_path: Path) -> None:
+def test_changed_source_message_makes_no_operator_a_culprit(kept: Path, tmp_path: Path) -> None:
     one = checked(tampered(kept, tmp_path / "t.mcap", messages=at("kept/robot/imu", 40, moved)))
 
     assert one.changed == ("kept/robot/imu #40",)
@@ -95,7 +96,7 @@ def test_a_source_message_that_was_added_is_noticed(kept: Path, tmp_path: Path) 
     assert one.verdict == "not wholly verified"
 
 
-def test_a_source_message_that_nobody_misses_is_noted_all_the_same(kept: Path, tmp_path: Path) -> None:
+def test_missing_source_message_that_no_call_took_is_noted(kept: Path, tmp_path: Path) -> None:
     one = checked(tampered(kept, tmp_path / "t.mcap", messages=at("kept/robot/odometry", 74, lambda found: [])))
 
     assert one.report is not None
@@ -107,9 +108,7 @@ def test_a_source_message_that_nobody_misses_is_noted_all_the_same(kept: Path, t
 
 
 @pytest.mark.parametrize("lost", [range(20, 24), range(70, 10**6)], ids=["middle", "last"])
-def test_messages_that_another_operator_took_and_that_are_not_stored_are_made_again(
-    kept: Path, tmp_path: Path, lost: range
-) -> None:
+def test_messages_that_were_taken_and_not_stored_are_made_again(kept: Path, tmp_path: Path, lost: range) -> None:
     def drop(found: Recorded) -> Kept:
         return [] if found.stream == "kept/look/seen" and found.seq in lost else as_it_is(found)
 
@@ -132,7 +131,7 @@ def without(operator: str, first: int, last: int) -> Callable[[FiringRecord], bo
     [(0, 10**6), (0, 3), (5, 9), (20, 10**6), (-1, -1)],
     ids=["all", "first", "middle", "last", "none"],
 )
-def test_firing_records_that_are_lost_are_noticed_of_sources_as_of_operators(
+def test_lost_firing_records_are_noticed_of_sources_and_operators(
     kept: Path, tmp_path: Path, operator: str, first: int, last: int
 ) -> None:
     one = checked(tampered(kept, tmp_path / "t.mcap", records=without(operator, first, last)))
@@ -143,7 +142,7 @@ def test_firing_records_that_are_lost_are_noticed_of_sources_as_of_operators(
 
 
 @pytest.mark.parametrize("last", [pytest.param(3, marks=pytest.mark.long), -1], ids=["first", "none"])
-def test_records_of_a_source_that_nobody_takes_are_missed_too(tmp_path: Path, last: int) -> None:
+def test_lost_records_of_source_without_consumer_are_noticed(tmp_path: Path, last: int) -> None:
     text = """\
 graph: two
 namespace: test
@@ -158,7 +157,7 @@ operators:
     assert one.passed is (last < 0)
 
 
-def test_what_lies_after_a_cut_of_a_source_is_no_loss(kept: Path, tmp_path: Path) -> None:
+def test_messages_after_cut_of_source_are_no_loss(kept: Path, tmp_path: Path) -> None:
     path = tampered(
         kept,
         tmp_path / "t.mcap",
@@ -175,74 +174,71 @@ def test_what_lies_after_a_cut_of_a_source_is_no_loss(kept: Path, tmp_path: Path
     assert robot.unaccounted > 0
 
 
-def test_a_run_that_ended_before_anything_was_called_is_not_passed_as_verified(kept: Path, tmp_path: Path) -> None:
-    path = tampered(
-        kept,
-        tmp_path / "t.mcap",
-        messages=lambda found: [],
-        records=lambda r: r.kind == "setup",
-        metadata=ended("interrupted"),
-    )
+def test_run_without_calls_does_not_pass(kept: Path, tmp_path: Path) -> None:
+    changes: dict[str, Any] = {
+        "messages": lambda found: [],
+        "records": lambda r: r.kind == "setup",
+        "metadata": ended("interrupted"),
+    }
 
-    one = checked(path)
+    one = checked(tampered(kept, tmp_path / "t.mcap", **changes))
 
     assert one.verdict == "nothing verified"
     assert not one.passed
 
 
-def test_a_run_that_failed_while_it_started_says_so(kept: Path, tmp_path: Path) -> None:
-    path = tampered(
-        kept,
-        tmp_path / "t.mcap",
-        messages=lambda found: [],
-        records=lambda r: r.operator == "robot" and r.kind == "setup",
-        metadata=ended("failed: operator 'look' failed in setup()"),
-    )
+GARBAGE = (b"\xc1\xff" + bytes(20), b"", b"\x91" * 5000, b"\x80")
+NO_GRAPHS = ("", "5", "[" * 100_000, '{"root": 5}', '{"format": 1, "file": "x", "files": 3}')
 
-    one = checked(path)
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        (
+            {
+                "messages": lambda found: [],
+                "records": lambda r: r.operator == "robot" and r.kind == "setup",
+                "metadata": ended("failed: operator 'look' failed in setup()"),
+            },
+            "recorded run ended before operator 'look' began (its outcome: failed: operator 'look' failed in setup()",
+        ),
+        ({"metadata": {"dataflow:ends": {"kept/robot/imu": "{"}}}, "how stream 'kept/robot/imu' ended cannot be read"),
+        *(({"metadata": {"dataflow:graph": {"bundle": bundle}}}, "graph") for bundle in NO_GRAPHS),
+        *(
+            (
+                {"batches": lambda name, data, of=of, put=put: put if name == of else data},
+                f"t.mcap: firing records of operator {of!r} are damaged: not a batch of firing records (",
+            )
+            for of in ("robot", "look")
+            for put in GARBAGE
+        ),
+    ],
+)
+def test_damage_is_an_error_of_the_recording(kept: Path, tmp_path: Path, changes: dict[str, Any], error: str) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", **changes))
 
     assert one.report is None
-    assert (
-        "the recorded run ended before operator 'look' began (its outcome: failed: operator 'look' failed in setup()"
-        in one.error
-    )
+    assert error in one.error
     assert not one.internal
 
 
-@pytest.mark.parametrize("operator", ["robot", "look"])
-@pytest.mark.parametrize("garbage", [b"\xc1\xff" + bytes(20), b"", b"\x91" * 5000, b"\x80"])
-def test_garbage_among_firing_records_names_file_and_operator(
-    kept: Path, tmp_path: Path, operator: str, garbage: bytes
-) -> None:
-    path = tampered(kept, tmp_path / "t.mcap", batches=lambda name, data: garbage if name == operator else data)
-
-    one = checked(path)
-
-    assert one.report is None
-    assert f"{path}: firing records of operator {operator!r} are damaged: not a batch of firing records (" in one.error
-    assert not one.internal
-
-
-@pytest.mark.parametrize("bundle", ["", "5", "[" * 100_000, '{"root": 5}', '{"format": 1, "file": "x", "files": 3}'])
-def test_what_stands_in_place_of_the_graph_ends_in_a_clear_error(kept: Path, tmp_path: Path, bundle: str) -> None:
-    one = checked(tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": bundle}}))
-
-    assert one.report is None
-    assert "graph" in one.error
-    assert not one.internal
-
-
-def test_an_end_of_a_stream_that_cannot_be_read_is_an_error_of_the_recording(kept: Path, tmp_path: Path) -> None:
-    one = checked(tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:ends": {"kept/robot/imu": "{"}}))
-
-    assert one.report is None
-    assert "how stream 'kept/robot/imu' ended cannot be read" in one.error
-    assert not one.internal
-
-
-def test_the_graph_in_the_file_is_not_even_read_where_another_is_named(kept: Path, tmp_path: Path) -> None:
+def test_recorded_graph_is_not_read_if_another_is_given(kept: Path, tmp_path: Path) -> None:
     with Recording(kept) as recording:
         graph = recorded_graph(recording)
     path = tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": "no graph"}})
 
     assert verify(path, graph=graph).identical
+
+
+@pytest.mark.long
+def test_recording_with_gaps_is_replayed_in_processes_as_in_one(kept: Path, tmp_path: Path) -> None:
+    def without(found: Recorded) -> Kept:
+        return [] if found.stream == "kept/robot/imu" and found.seq in (10, 11, 15) else as_it_is(found)
+
+    path = tampered(kept, tmp_path / "gapped.mcap", messages=without)
+
+    apart = replay(path, placement="process_each")
+
+    assert apart.digests() == replay(path, placement="one_process").digests()
+    with Recording(path) as recording:
+        assert apart.streams["kept/robot/imu"][0] == recording.streams["kept/robot/imu"].count

@@ -9,9 +9,9 @@ from __future__ import annotations
 import mmap
 import os
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from dataflow.execution.recorded import RecordedRunner, Watcher
+from dataflow.supervision.core.report import OperatorCounts
 
 PHASES = ("start", "setup", "fire", "read", "close")
 _HEAD = 3
@@ -19,29 +19,12 @@ _COUNTS = 6
 _WORD = 8
 
 
-class Counts(NamedTuple):
-    """Of one operator: firings and messages so far, CPU time, the stamp it has done, calls repeated, wall time (ns)."""
-
-    firings: int
-    emitted: int
-    cpu_ns: int
-    done: int
-    repeated: int
-    wall_ns: int
-
-
-class Place(NamedTuple):
-    """The step that a worker is at: the phase, and the operator whose turn it is (empty for none)."""
-
-    phase: str
-    operator: str
-
-
 class Board(Watcher):
     """The shared memory of one worker and its parent: who opens it by its descriptor sees what the other wrote.
 
-    Integers of 64 bits: phase, operator, steps, then `Counts` of each operator. A parent that reads while the worker
-    writes may see counts of two moments, which is good enough for a display.
+    Integers of 64 bits: phase, operator, steps, then of each operator its firings, messages, CPU time (ns), the stamp
+    it has done, calls repeated and wall time (ns). A parent that reads while the worker writes may see counts of two
+    moments, which is good enough for a display.
     """
 
     def __init__(self, descriptor: int, operators: Sequence[str]) -> None:
@@ -80,14 +63,16 @@ class Board(Watcher):
         """The number of steps so far: a worker in which it stands still makes no progress."""
         return self._cells[2]
 
-    def place(self) -> Place:
-        """The step that the worker is at, or was at when it died."""
+    def place(self) -> tuple[str, str]:
+        """The phase that the worker is at, or was at when it died, and the operator whose turn it is ("" for none)."""
         operator = self._cells[1]
-        return Place(PHASES[self._cells[0]], "" if operator < 0 else self.operators[operator])
+        return PHASES[self._cells[0]], "" if operator < 0 else self.operators[operator]
 
-    def counts(self, operator: str) -> Counts:
+    def counts(self, operator: str) -> tuple[OperatorCounts, int]:
+        """The counts of an operator, and how many of its calls were repeated."""
         at = _HEAD + _COUNTS * self._index[operator]
-        return Counts(*self._cells[at : at + _COUNTS])
+        firings, emitted, cpu_ns, done, repeated, wall_ns = self._cells[at : at + _COUNTS]
+        return OperatorCounts(firings, emitted, 0, cpu_ns, done, wall_ns), repeated
 
     def close(self) -> None:
         """Lets go of the memory."""

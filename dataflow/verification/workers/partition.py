@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import with_makers
 from dataflow.records.reading import FiringLog
 from dataflow.verification.books import Books
 from dataflow.verification.workers import slices
@@ -54,7 +55,8 @@ def planned(
     work = {n: books.of(n).duration + PER_FIRING_NS * books.of(n).records for n in operators}
     jobs = jobs or jobs_for(work, cores)
     whole = units(graph, held, operators)
-    alone = {name: work[name] for name in whole if divide and jobs > 1 and not _takes_its_own(graph, held, name)}
+    looped = {n.name for n in graph.nodes.values() if not n.taken.intersection(n.outputs.values()).issubset(held)}
+    alone = {name: work[name] for name in whole if divide and jobs > 1 and name not in looped}
     divided = {name: (work[name], whole.pop(name)) for name in slices.divisible(graph, books, alone)}
     level = sum(work.values()) // jobs if divided else 0
     parts = [set(part) for part in balanced(list(whole.values()), work, jobs, level)]
@@ -79,36 +81,23 @@ def planned(
     ]
 
 
-def _takes_its_own(graph: Graph, held: Collection[str], name: str) -> bool:
-    taken = {stream for given in graph.nodes[name].inputs.values() for stream in given}
-    return any(stream not in held for stream in taken.intersection(graph.nodes[name].outputs.values()))
-
-
 def units(graph: Graph, held: Collection[str], operators: Collection[str]) -> dict[str, frozenset[str]]:
     """By each operator that no other of them needs: it, and those that make what it takes and is not `held`.
 
     Each unit can be fed from a recording that holds the streams in `held`. An operator that several need is in each of
     their units: to repeat it twice costs its time, to repeat it once would cost that they can be repeated side by side.
     """
-    needs = {name: _needed(graph, held, operators, name) for name in graph.nodes if name in operators}
+    needs = {
+        name: frozenset(with_makers(held, graph, {name}).intersection(operators))
+        for name in graph.nodes
+        if name in operators
+    }
     for_others = {maker for name, needed in needs.items() for maker in needed - {name}}
     found = {name: needed for name, needed in needs.items() if name not in for_others}
     for name, needed in needs.items():
         if not any(name in unit for unit in found.values()):
             found[name] = needed  # feed only one another
     return found
-
-
-def _needed(graph: Graph, held: Collection[str], operators: Collection[str], name: str) -> frozenset[str]:
-    """The operator, and those of `operators` that make its inputs as far as these are not `held`, theirs, and so on."""
-    needed, left = {name}, [name]
-    while left:
-        for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
-            maker = graph.streams[stream].node
-            if stream not in held and maker in operators and maker not in needed:
-                needed.add(maker)
-                left.append(maker)
-    return frozenset(needed)
 
 
 def jobs_for(work: Mapping[str, int], cores: int) -> int:
@@ -142,9 +131,7 @@ def balanced(
 
 def with_checks(graph: Graph, parts: Sequence[Job], checks: Collection[str]) -> list[Job]:
     """Each stream to check goes to a part that reads it anyway, else to the one that makes it, else to the first."""
-    taken = [
-        {s for name in part.operators for given in graph.nodes[name].inputs.values() for s in given} for part in parts
-    ]
+    taken = [{stream for name in part.operators for stream in graph.nodes[name].taken} for part in parts]
     chosen: list[list[str]] = [[] for _ in parts]
     for stream in sorted(checks):
         readers = [k for k, streams in enumerate(taken) if stream in streams]

@@ -31,13 +31,13 @@ class Started:
     def __init__(self) -> None:
         self.pid = 0
         self._process: Process | None = None
-        self.letter, self.board = os.memfd_create("call"), os.memfd_create("board")
-        self.words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        self.job_file, self.board = os.memfd_create("call"), os.memfd_create("board")
+        self.output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self.channel, self.theirs = Channel.pair()
 
     def handed(self) -> tuple[int, int, int, int]:
         """Returns the descriptors that the worker inherits."""
-        return self.theirs, self.letter, self.board, self.words.fileno()
+        return self.theirs, self.job_file, self.board, self.output.fileno()
 
     def spawn(self, variables: Mapping[str, str], python: str = sys.executable) -> None:
         """Starts its process with an environment."""
@@ -62,10 +62,10 @@ class Started:
                 self._process.wait(timeout=LEAVE_WITHIN)
             else:
                 _await_end(self.pid)
-        for descriptor in (self.letter, self.board):
+        for descriptor in (self.job_file, self.board):
             os.close(descriptor)
         self.channel.close()
-        self.words.close()
+        self.output.close()
 
 
 def _await_end(pid: int) -> None:
@@ -84,7 +84,7 @@ def _spawn(workers: list[Started], variables: Mapping[str, str], python: str = s
     slots = [",".join(map(str, each)) for each in handed]
     try:
         descriptors = [descriptor for each in handed for descriptor in each]
-        words = workers[0].words.fileno()
+        words = workers[0].output.fileno()
         return start("dataflow.verification.workers.worker", slots, descriptors, variables, python, words)
     finally:
         for worker in workers:

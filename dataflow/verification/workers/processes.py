@@ -12,10 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from dataflow.environments import Environment, environment_of
 from dataflow.execution.threads import environment
@@ -23,7 +22,7 @@ from dataflow.process.channel import ChannelClosed, ready
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, Watch
 from dataflow.supervision.interrupts import interrupts
 from dataflow.verification.workers.board import Board
-from dataflow.verification.workers.mail import read_letter, write_letter
+from dataflow.verification.workers.job_file import read_job_file, write_job_file
 from dataflow.verification.workers.prestart import LEAVE_WITHIN, EarlyWorkers, Started, as_bytes
 
 LOOK_EVERY = 0.1
@@ -76,9 +75,8 @@ def call_workers(
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
             started = None if early is None or call.env is not None else early.take(threads)
-            workers.append(
-                stack.enter_context(_Worker(number, call, started, threads, locate, envs.get(call.env or "")))
-            )
+            worker = _Worker(number, call, started, threads, locate, envs.get(call.env or ""))
+            workers.append(stack.enter_context(closing(worker)))
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
             for channel in ready([worker.channel for worker in left], LOOK_EVERY):
@@ -101,8 +99,7 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
         if worker.board.steps:
             status.phase = "running"
         for name in worker.call.operators:
-            c = worker.board.counts(name)
-            told = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
+            told, _ = worker.board.counts(name)
             before = seen.get(name)
             if before is not None and name in worker.call.request.get("slices", ()):
                 told = told.after(before)
@@ -118,13 +115,7 @@ class _Worker:
     """One worker process, as its parent sees it."""
 
     def __init__(
-        self,
-        number: int,
-        call: Call,
-        started: Started | None,
-        threads: int,
-        locate: Locate,
-        env: Environment | None,
+        self, number: int, call: Call, started: Started | None, threads: int, locate: Locate, env: Environment | None
     ) -> None:
         """`started`: a process that waits already."""
         variables, python = {**environment(threads), **call.environment}, sys.executable
@@ -135,10 +126,10 @@ class _Worker:
             started.spawn(variables, python)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
-        self._letter, self.channel, self._words = started.letter, started.channel, started.words
+        self._job_file, self.channel, self._output = started.job_file, started.channel, started.output
         self.board = Board(started.board, call.operators)
-        write_letter(
-            self._letter,
+        write_job_file(
+            self._job_file,
             {
                 "function": call.function,
                 "request": dict(call.request),
@@ -158,7 +149,7 @@ class _Worker:
             raise self._failed(self._end()) from None
         if kind == "waiting":
             return
-        answer = read_letter(self._letter)
+        answer = read_job_file(self._job_file)
         if kind == "failed":
             raise RunFailed(answer["summary"], answer["traceback"], answer["operator"])
         self.answered, self.answer = True, answer["value"]
@@ -185,24 +176,17 @@ class _Worker:
 
     def _failed(self, what: str) -> RunFailed:
         phase, operator = self.board.place()
-        self._words.seek(0, os.SEEK_END)
-        self._words.seek(max(0, self._words.tell() - LAST_WORDS))
-        words = self._words.read().decode(errors="backslashreplace")
+        self._output.seek(0, os.SEEK_END)
+        self._output.seek(max(0, self._output.tell() - LAST_WORDS))
+        words = self._output.read().decode(errors="backslashreplace")
         if not operator:
             doing = "while starting" if phase == "start" else "while reading the recording"
             of = f" (operators {', '.join(self.call.operators)})" if self.call.operators else ""
             return RunFailed(f"worker {self.number}{of} {what} {doing}", words)
-        at = f"{phase}()" if phase != "fire" else self._located(operator)
+        at = f"{phase}()" if phase != "fire" else self._locate(self.call, operator, self.board.counts(operator)[1])
         return RunFailed(f"operator {operator!r} {what} in {at}", words, operator)
 
-    def _located(self, operator: str) -> str:
-        return self._locate(self.call, operator, self.board.counts(operator).repeated)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Ends the process."""
         self.board.close()
         self._started.end()

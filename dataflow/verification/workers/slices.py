@@ -100,8 +100,8 @@ def together(found: Sequence[Mapping[str, Any]], book: Book) -> Mapping[str, Any
 
 def answer(books: Books, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
     """Puts together what `answers` say of divided operators, as one answer more; names those to verify as a whole."""
-    told: dict[str, Any] = {"operators": {}, "work": {}, "digests": {}, "comparisons": {}, "stored": []}
-    told |= {"reading": 0, "wall": 0.0}
+    told: dict[str, Any] = {name: {} for name in ("operators", "work", "digests", "comparisons")}
+    told |= {"stored": [], "reading": 0, "wall": 0.0}
     left = set[str]()
     for name in {name for each in answers for name in each["slices"]}:
         book = books.of(name)
@@ -111,8 +111,7 @@ def answer(books: Books, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str
             left.add(name)
             continue
         told["operators"][name] = verification
-        told["work"][name] = astuple(
-            reduce(lambda base, one: one.after(base), (OperatorCounts(*e["work"]) for e in of))
-        )
+        counts = (OperatorCounts(*each["work"]) for each in of)
+        told["work"][name] = astuple(reduce(lambda base, one: one.after(base), counts))
         told["digests"] |= {stream: [digest.count, digest.hexdigest()] for stream, digest in book.digests.items()}
     return told, left

@@ -24,13 +24,13 @@ from dataflow.parent import end_with_parent
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.workers.board import Board
-from dataflow.verification.workers.mail import read_letter, write_letter
+from dataflow.verification.workers.job_file import read_job_file, write_job_file
 
 FAILED = 1
 PRELOAD = "dataflow.verification.workers.job"
 
 Slot = tuple[int, ...]
-"""Descriptors that a parent hands down for one worker: its channel, the letter, the board, its output."""
+"""Descriptors that a parent hands down for one worker: its channel, the job file, the board, its output."""
 
 
 def main(slots: Sequence[Slot]) -> int:
@@ -68,7 +68,7 @@ def _serve_apart(slot: Slot, slots: Sequence[Slot], parent: int) -> int:
 def serve(slot: Slot) -> int:
     """Announces that it waits; when it may go, makes the call that the file holds and puts the answer in its place.
     Returns the exit code."""
-    descriptor, letter, board, *_ = slot
+    descriptor, job_file, board, *_ = slot
     channel = Channel(descriptor)
     try:
         channel.send("waiting", pid=os.getpid())
@@ -77,7 +77,7 @@ def serve(slot: Slot) -> int:
     except ChannelClosed:
         return FAILED
     threading.Thread(target=_end_with, args=(channel,), name="parent", daemon=True).start()
-    fields = read_letter(letter)
+    fields = read_job_file(job_file)
     take_over(fields["environment"])
     code = 0
     try:
@@ -91,7 +91,7 @@ def serve(slot: Slot) -> int:
         summary = str(error) or type(error).__name__
         kind, code = "failed", FAILED
         answer = {"summary": summary, "traceback": text, "operator": getattr(error, "operator", None)}
-    write_letter(letter, answer)
+    write_job_file(job_file, answer)
     try:
         channel.send(kind)
     except ChannelClosed:

@@ -8,13 +8,12 @@ digests.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 import os
 import random
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -330,26 +329,18 @@ def _call_here(calls: Sequence[Call], **options: Any) -> list[Any]:
     for call in calls:
         module, _, name = call.function.partition(":")
         function = getattr(importlib.import_module(module), name)
-        with _board(call) as board:
-            answers.append(function(call.request, board))
+        descriptor = os.memfd_create("board")
+        try:
+            answers.append(function(call.request, Board(descriptor, call.operators)))
+        finally:
+            os.close(descriptor)
     return answers
-
-
-@contextlib.contextmanager
-def _board(call: Call) -> Iterator[Board]:
-    descriptor = os.memfd_create("board")
-    try:
-        yield Board(descriptor, call.operators)
-    finally:
-        os.close(descriptor)
 
 
 # Losses
 
 Place = tuple[str, int, int]
 """Stream, incarnation and number of a message."""
-
-
 Records = Mapping[str, Sequence[FiringRecord]]
 
 

@@ -16,7 +16,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from dataflow.process.stacks import ASK
 from simulation.world import EPOCH, Process, Task, World
@@ -27,6 +27,7 @@ PIPE_BYTES = 212_992
 """Bytes that a socket holds by Linux's defaults."""
 OVERHEAD = 704
 """Bytes that Linux adds to each message, however small."""
+T = TypeVar("T")
 
 
 class Waiters:
@@ -45,6 +46,13 @@ class Waiters:
         finally:
             if task in self._tasks:
                 self._tasks.remove(task)
+
+    def wait_until(self, ready: Callable[[], T], timeout: float | None = None) -> T:
+        """Waits until something is true, or the time is up; returns it."""
+        until = math.inf if timeout is None else self._world.now + timeout
+        while not (found := ready()) and self._world.now < until:
+            self.wait(None if until == math.inf else until - self._world.now)
+        return found
 
     def add(self, task: Task) -> None:
         self._tasks.append(task)
@@ -133,10 +141,7 @@ class Event:
 
     def wait(self, timeout: float | None = None) -> bool:
         self._world.call()
-        until = None if timeout is None else self._world.now + timeout
-        while not self._set and (until is None or self._world.now < until):
-            self._waiters.wait(None if until is None else until - self._world.now)
-        return self._set
+        return self._waiters.wait_until(self.is_set, timeout)
 
 
 class Condition:
@@ -234,13 +239,10 @@ class SimpleQueue:
         self._items.append(item)
         self._waiters.notify()
 
-    def get(self, timeout: float = math.inf) -> Any:
+    def get(self, timeout: float | None = None) -> Any:
         self._world.call()
-        until = self._world.now + timeout
-        while not self._items:
-            if self._world.now >= until:
-                raise queue.Empty
-            self._waiters.wait(None if until == math.inf else until - self._world.now)
+        if not self._waiters.wait_until(lambda: self._items, timeout):
+            raise queue.Empty
         item = self._items.popleft()
         if self._most < math.inf:
             self._waiters.notify()
@@ -405,28 +407,19 @@ class Sockets:
         return self._system.things[fileno]
 
 
-class ReadEnd:
-    """The end of a pipe that is read."""
+class End:
+    """The end of a pipe that is read, or that is written."""
 
-    def __init__(self, system: System, pipe: Pipe) -> None:
-        self.pipe = pipe
+    writable = False
+
+    def __init__(self, system: System, pipe: Pipe, *, reads: bool) -> None:
+        self.pipe, self.reads = pipe, reads
         self.descriptor = system.open(self)
-        self.writable = False
         self.waiters = (pipe.changed,)
 
     @property
     def readable(self) -> bool:
-        return self.pipe.readable
-
-
-class WriteEnd:
-    """The end of a pipe that is written."""
-
-    def __init__(self, system: System, pipe: Pipe) -> None:
-        self.pipe = pipe
-        self.descriptor = system.open(self)
-        self.readable = self.writable = False
-        self.waiters = (pipe.changed,)
+        return self.reads and self.pipe.readable
 
 
 class System:
@@ -446,9 +439,9 @@ class System:
     def forget(self, descriptor: int) -> None:
         self.things.pop(descriptor, None)
 
-    def pipe(self) -> tuple[ReadEnd, WriteEnd]:
+    def pipe(self) -> tuple[End, End]:
         pipe = Pipe(self.world)
-        return ReadEnd(self, pipe), WriteEnd(self, pipe)
+        return End(self, pipe, reads=True), End(self, pipe, reads=False)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
@@ -483,10 +476,8 @@ class System:
             os.close(descriptor)
             return
         thing = self.things.pop(descriptor, None)
-        if isinstance(thing, ReadEnd):
-            thing.pipe.end_reading()
-        elif isinstance(thing, WriteEnd):
-            thing.pipe.end_writing()
+        if isinstance(thing, End):
+            (thing.pipe.end_reading if thing.reads else thing.pipe.end_writing)()
 
     def eventfd(self, initial: int, flags: int = 0) -> int:
         return EventFd(self).descriptor
@@ -590,13 +581,10 @@ class Poll:
     def poll(self, milliseconds: float | None = None) -> list[tuple[int, int]]:
         if not self._things:
             return self._real.poll(milliseconds)
-        world = self._system.world
-        world.call()
-        until = None if milliseconds is None else world.now + milliseconds / 1000
-        while not (ready := self._ready()) and (until is None or world.now < until):
-            first = next(iter(self._things.values()))
-            first.changed.wait(None if until is None else until - world.now)
-        return ready
+        self._system.world.call()
+        first = next(iter(self._things.values()))
+        waiters: Waiters = first.changed
+        return waiters.wait_until(self._ready, None if milliseconds is None else milliseconds / 1000)
 
     def _ready(self) -> list[tuple[int, int]]:
         return [(descriptor, select.POLLIN) for descriptor, thing in self._things.items() if thing.readable]
@@ -614,14 +602,10 @@ class Epoll:
         self._seen[descriptor] = 0
 
     def poll(self, seconds: float | None = None) -> list[tuple[int, int]]:
-        world, things = self._system.world, self._system.things
-        world.call()
-        until = None if seconds is None else world.now + seconds
-        while not (ready := [d for d, seen in self._seen.items() if things[d].count != seen]) and (
-            until is None or world.now < until
-        ):
-            first = things[next(iter(self._seen))]
-            first.changed.wait(None if until is None else until - world.now)
+        things = self._system.things
+        self._system.world.call()
+        waiters: Waiters = things[next(iter(self._seen))].changed
+        ready = waiters.wait_until(lambda: [d for d, seen in self._seen.items() if things[d].count != seen], seconds)
         for descriptor in ready:
             self._seen[descriptor] = things[descriptor].count
         return [(descriptor, select.EPOLLIN) for descriptor in ready]
@@ -639,9 +623,7 @@ class Signals:
         world, process = self._system.world, self._system.things[descriptor].process
         if number == ASK:
             return  # what its threads are at is nothing to a simulated process
-        does = {int(signal.SIGKILL): world.kill, int(signal.SIGSTOP): world.freeze, int(signal.SIGCONT): world.thaw}[
-            number
-        ]
+        does = {self.SIGKILL: world.kill, self.SIGSTOP: world.freeze, self.SIGCONT: world.thaw}[signal.Signals(number)]
         world.after(world.latency(), lambda: None if process.dead else does(process))
 
 

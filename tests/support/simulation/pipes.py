@@ -18,6 +18,7 @@ import zenoh
 from dataflow.machines.pipe import Pipe
 from simulation import machine
 from simulation.bindings import Bindings, bound, clocks
+from simulation.shrink import smallest
 from simulation.world import Violation, World
 
 SETTLES = 60.0
@@ -280,20 +281,7 @@ def _bindings(world: World) -> Bindings:
 
 def shrunk(journey: Journey, violation: Violation, *, most: int = 100) -> tuple[Journey, str]:
     """Returns the smallest journey found that breaks a promise, and which."""
-    said, tried = str(violation), 0
-    progress = True
-    while progress:
-        progress = False
-        for smaller in _smaller(journey):
-            if tried >= most:
-                return journey, said
-            tried += 1
-            try:
-                travel(smaller)
-            except Violation as broken:
-                journey, said, progress = smaller, str(broken), True
-                break
-    return journey, said
+    return smallest(journey, violation, _smaller, travel, most)
 
 
 def _smaller(journey: Journey) -> Iterator[Journey]:

@@ -9,7 +9,8 @@ from typing import Any
 from dataflow.process.channel import QueuedChannel
 from dataflow.supervision.nursery import Child, End, Leftovers
 from dataflow.supervision.process_main import main
-from simulation.machine import Handle, ReadEnd, Socket, System, Waiters, WriteEnd
+from simulation.machine import End as PipeEnd
+from simulation.machine import Handle, Socket, System, Waiters
 from simulation.world import Killed, Process, World
 
 FORKING = 0.003
@@ -42,7 +43,7 @@ class Nursery:
         self._world.after(self._world.random.random() * FORKING, lambda: self._fork(child, reading, writing, handed))
         return child
 
-    def _fork(self, child: Child, reading: ReadEnd, writing: WriteEnd, handed: Sequence[int]) -> None:
+    def _fork(self, child: Child, reading: PipeEnd, writing: PipeEnd, handed: Sequence[int]) -> None:
         world, theirs = self._world, self._system.things[child.channel.theirs]
         process = world.process(self._named(child))
         handle = Handle(self._system, process)

@@ -97,12 +97,7 @@ class Outcome:
 
 
 def simulate(
-    plan: RunPlan,
-    machine_: Machine,
-    happenings: Sequence[Happening] = (),
-    *,
-    mode: str = "run",
-    limit: float = LIMIT,
+    plan: RunPlan, machine_: Machine, happenings: Sequence[Happening] = (), *, mode: str = "run", limit: float = LIMIT
 ) -> Outcome:
     """Runs a plan to its end. Raises `Violation` when it comes to none within `limit` s."""
     return Simulation(plan, machine_, happenings, mode, limit).run()
@@ -288,9 +283,8 @@ class Simulation:
                 world.after(fields["span"], lambda: world.thaw(process))
             case "pause":
                 labels = {SUPERVISOR, happening.target}
-                for each in [
-                    p for p in world.processes if not p.dead and (happening.target == "*" or p.label in labels)
-                ]:
+                alive = [p for p in world.processes if not p.dead]
+                for each in [p for p in alive if happening.target == "*" or p.label in labels]:
                     world.freeze(each)
                     world.after(fields["span"], functools.partial(world.thaw, each))
 

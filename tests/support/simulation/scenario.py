@@ -114,18 +114,26 @@ class Scenario:
     rate: float | None = None
 
     def load(self) -> Graph:
-        return load(
-            self.graph,
-            self.parts,
-            self.inner,
-            self.live,
-            self.count,
-            self.period,
-            self.work,
-            self.reading,
-            self.policy,
-            self.keeping.section,
-        )
+        drawn_here = "".join(f"\n  {part}" for part in self.parts) + "\n"
+        operators = {TICKING: TICKS, DRAWN: drawn_here}.get(self.graph) or GRAPHS[self.graph]
+        text = f"graph: {self.graph}\nnamespace: sim\noperators:{operators}{self.keeping.section}"
+        words = {
+            "SOURCE": _DEVICE if self.live else _SOURCE,
+            "PAIR": _JUMPS if self.live else _PAIR,
+            "OTHER": _OTHER,
+            "SHORT": _SHORT,
+            "LIVE": f", live: {{{self.policy}}}" if self.policy else "",
+            "LINE": f"\n    live: {{{self.policy}}}" if self.policy else "",
+            "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in self.policy else "",
+            "COUNT": str(self.count),
+            "PERIOD": str(self.period),
+            "READING": str(self.reading),
+            "WORK": str(self.work),
+        }
+        part = "\n".join(self.inner)
+        for word, meaning in words.items():
+            text, part = text.replace(word, meaning), part.replace(word, meaning)
+        return _loaded(text, part)
 
     @property
     def may_fail(self) -> bool:
@@ -178,40 +186,10 @@ class Scenario:
 
 
 @functools.lru_cache(maxsize=4096)
-def load(
-    graph: str,
-    parts: tuple[str, ...],
-    inner: tuple[str, ...],
-    live: bool,
-    count: int,
-    period: int,
-    work: float,
-    reading: float,
-    policy: str,
-    record: str,
-) -> Graph:
-    """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
-    drawn_here = "".join(f"\n  {part}" for part in parts) + "\n"
-    operators = {TICKING: TICKS, DRAWN: drawn_here}.get(graph) or GRAPHS[graph]
-    text = f"graph: {graph}\nnamespace: sim\noperators:{operators}{record}"
-    words = {
-        "SOURCE": _DEVICE if live else _SOURCE,
-        "PAIR": _JUMPS if live else _PAIR,
-        "OTHER": _OTHER,
-        "SHORT": _SHORT,
-        "LIVE": f", live: {{{policy}}}" if policy else "",
-        "LINE": f"\n    live: {{{policy}}}" if policy else "",
-        "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in policy else "",
-        "COUNT": str(count),
-        "PERIOD": str(period),
-        "READING": str(reading),
-        "WORK": str(work),
-    }
-    part = "\n".join(inner)
-    for word, meaning in words.items():
-        text, part = text.replace(word, meaning), part.replace(word, meaning)
+def _loaded(text: str, part: str) -> Graph:
+    """Loads a graph, with the nested one that it uses; loading takes longer than some runs, so each is loaded once."""
     with by_blocks():
-        return load_text(text, files={NESTED: part} if inner else None)
+        return load_text(text, files={NESTED: part} if part else None)
 
 
 def scenario_of(seed: int) -> Scenario:

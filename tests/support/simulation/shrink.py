@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 from dataflow.graph import GraphError
 from simulation.check import check
@@ -24,30 +26,36 @@ MOST = 250
 """Runs that shrinking may take."""
 
 Check = Callable[[Scenario, Path], object]
+T = TypeVar("T")
 
 
 def shrink(
     scenario: Scenario, folder: Path, violation: Violation, *, run: Check = check, most: int = MOST
 ) -> tuple[Scenario, str]:
     """Returns the smallest scenario found, and which promise it breaks."""
+    return smallest(scenario, violation, _tries, lambda tried: run(tried, folder), most)
+
+
+def smallest(
+    found: T, violation: Violation, smaller: Callable[[T], Iterator[T]], run: Callable[[T], object], most: int
+) -> tuple[T, str]:
+    """Returns the smallest of what breaks a promise, and which, in `most` runs; `smaller` yields what to try next."""
     said, left = str(violation), most
-    progress = True
-    while progress and left > 0:
-        progress = False
-        for smaller in filter(_is_graph, _smaller(scenario)):
-            for attempt in range(MACHINES):
-                if left <= 0:
-                    break
-                left -= 1
-                tried = _on_machine(smaller, attempt)
-                try:
-                    run(tried, folder)
-                except Violation as broken:
-                    scenario, said, progress = tried, str(broken), True
-                    break
-            if progress:
+    while True:
+        for tried in islice(smaller(found), left):
+            left -= 1
+            try:
+                run(tried)
+            except Violation as broken:
+                found, said = tried, str(broken)
                 break
-    return scenario, said
+        else:
+            return found, said
+
+
+def _tries(scenario: Scenario) -> Iterator[Scenario]:
+    for smaller in filter(_is_graph, _smaller(scenario)):
+        yield from (_on_machine(smaller, attempt) for attempt in range(MACHINES))
 
 
 def _is_graph(scenario: Scenario) -> bool:

@@ -20,13 +20,6 @@ from zoo.operators import Hard
 SEEN = {"n": 0}
 
 
-class Day(Hard):
-    """Emits the day of the year, as a log file's name might have it."""
-
-    def work(self, x: FeatureVector) -> float:
-        return float(time.strftime("%j%Y"))
-
-
 class Wall(Hard):
     """Emits the age of its input by the clock of the machine."""
 

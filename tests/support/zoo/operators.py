@@ -449,12 +449,14 @@ class Divide(Hard):
 
 
 class Overwrite(Hard):
-    """Lets LAPACK work in place on its input."""
+    """Lets LAPACK work in place on its input, behind the first `since` calls."""
+
+    since: int = Param(0, ge=0, doc="calls in which it does not")
 
     def work(self, x: FeatureVector) -> Any:
         from scipy.linalg import inv
 
-        return inv(x.vectors.T, overwrite_a=True)[0]
+        return inv(x.vectors.T, overwrite_a=self.calls > self.since)[0]
 
 
 class KeepsEmitted(Hard):
