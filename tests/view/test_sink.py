@@ -30,6 +30,7 @@ from dataflow.messages import (
 )
 from dataflow.operator import FINDING
 from dataflow.recording import Recording, RecordingWriter
+from dataflow.view.layout import layout
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     import rerun.blueprint as rrb
@@ -175,7 +176,7 @@ STREAMS = {
 
 
 def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
-    assert views(blueprint(STREAMS)) == [
+    assert views(blueprint(layout(STREAMS))) == [
         ("3D", "World"),
         ("Graph", "Scene graph"),
         ("2D", "camera/image"),
@@ -190,16 +191,17 @@ def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
         ("StateTimeline", "Status"),
         ("TextLog", "Log"),
     ]
-    assert views(blueprint({"r/imu/data": Imu}))[-1] == ("TextLog", "Log")
-    assert ("3D", "World") not in views(blueprint({"r/imu/data": Imu}))
+    imu_alone = views(blueprint(layout({"r/imu/data": Imu})))
+    assert imu_alone[-1] == ("TextLog", "Log")
+    assert ("3D", "World") not in imu_alone
 
 
 def test_there_is_no_world_where_nothing_has_depth_or_a_place() -> None:
     flat = {"r/camera/image": Image, "r/camera/info": CameraInfo, "r/detector/boxes": Detections2D}
 
-    assert ("3D", "World") not in views(blueprint(flat))
-    assert ("3D", "World") in views(blueprint({**flat, "r/camera/depth": DepthImage}))
-    assert ("3D", "World") in views(blueprint({**flat, "r/odometry/pose": Pose}))
+    assert ("3D", "World") not in views(blueprint(layout(flat)))
+    assert ("3D", "World") in views(blueprint(layout({**flat, "r/camera/depth": DepthImage})))
+    assert ("3D", "World") in views(blueprint(layout({**flat, "r/odometry/pose": Pose})))
 
 
 def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
@@ -208,7 +210,7 @@ def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
             return list(part.contents) if part.name == name else []
         return [line for inner in part.contents for line in contents(name, inner)]
 
-    root = blueprint(STREAMS).root_container
+    root = blueprint(layout(STREAMS)).root_container
     assert contents("camera/image", root) == [
         "+ /r/camera/image",
         "+ /r/camera/image/scale/**",
