@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.messages import Imu, Odometry, Pose, Transforms
 
 F64 = npt.NDArray[np.float64]
@@ -70,12 +69,12 @@ class Motion:
         return np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
 
 
-def check_motion(material: Material) -> Iterator[Finding]:
+def check_motion(data: LintInput) -> Iterator[Finding]:
     """Looks at all messages of inertial sensors, odometry and poses."""
     motions = {}
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if facts.readable and facts.count > FEWEST and facts.type in ("Imu", "Odometry", "Pose"):
-            motion = _motion_of(material, name)
+            motion = _motion_of(data, name)
             if motion is not None:
                 motions[name] = motion
     wrong = set()
@@ -84,15 +83,15 @@ def check_motion(material: Material) -> Iterator[Finding]:
             wrong.add(name)
             yield Finding("motion", name, "warning", text)
     sound = {name: motion for name, motion in motions.items() if name not in wrong}
-    yield from _check_pairs(sound, _mounts(material))
+    yield from _check_pairs(sound, _mounts(data))
 
 
-def _motion_of(material: Material, stream: str) -> Motion | None:
+def _motion_of(data: LintInput, stream: str) -> Motion | None:
     """The motion in a stream; None where fewer messages than `FEWEST` have stamps that go forward."""
     rows: list[tuple[object, ...]] = []
     stamps: list[int] = []
     world = body = ""
-    for message in material.messages(stream):
+    for message in data.messages(stream):
         if stamps and message.stamp <= stamps[-1]:
             continue
         if isinstance(message, Imu):
@@ -221,11 +220,11 @@ Mounts = Mapping[str, tuple[str, Rotation]]
 """Static transforms: child frame → its parent, and the rotation that maps the child's coordinates to the parent's."""
 
 
-def _mounts(material: Material) -> Mounts:
+def _mounts(data: LintInput) -> Mounts:
     found: dict[str, tuple[str, Rotation]] = {}
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if facts.readable and facts.static and facts.type == "Transforms":
-            for message in material.messages(name):
+            for message in data.messages(name):
                 assert isinstance(message, Transforms)
                 for parent, child, turn in zip(message.frames, message.child_frames, message.rotations, strict=True):
                     found[child] = parent, Rotation.from_quat(turn)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 from scipy.spatial.transform import Rotation
 
 from dataflow.lint.motion import check_motion
@@ -68,7 +68,7 @@ def odometry(velocity: Callable[[int], Any] = lambda _: FORWARD, unit: float = 1
 
 
 def found(**streams: list[Message]) -> list[str]:
-    return [finding.text for finding in check_motion(MadeMaterial(streams))]
+    return [finding.text for finding in check_motion(MadeInput(streams))]
 
 
 @pytest.mark.parametrize(
