@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import get_args
 
-from dataflow.chaos import kinds
+from dataflow.chaos import faults as kinds
 from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
 from dataflow.supervision.core.health import LEVELS

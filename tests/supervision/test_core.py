@@ -21,9 +21,10 @@ from dataflow.supervision.core.events import (
     Said,
     Tick,
 )
+from dataflow.supervision.core.life import how_it_ended
 from dataflow.supervision.core.report import OperatorCounts
-from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof, Verdict
-from dataflow.supervision.core.wording import how_it_ended, how_long
+from dataflow.supervision.core.watchers.lateness import how_long
+from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof
 from dataflow.sync import FOREVER
 
 
@@ -404,18 +405,13 @@ def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> No
 def test_what_was_sent_and_not_received_counts_as_lost_only_after_a_while_in_which_nothing_moves(
     lost_after: float | None,
 ) -> None:
-    proof, under_way = (
-        Proof(lost_after),
-        [{"idle": True, "sent": 5, "received": 2}, {"idle": True, "sent": 1, "received": 3}],
-    )
-    assert proof.judge([{**under_way[0], "idle": False}], 0.0) is Verdict.MOVING
-    assert [proof.judge(under_way, now) for now in (1.0, 5.9)] == [Verdict.SETTLED] * 2
-    assert proof.judge(under_way, 6.0) is (Verdict.SETTLED if lost_after is None else Verdict.PROVEN)
+    proof = Proof(lost_after)
+    under_way = [{"idle": True, "sent": 5, "received": 2}, {"idle": True, "sent": 1, "received": 3}]
+    assert not proof.judge([{**under_way[0], "idle": False}], 0.0)
+    assert [proof.judge(under_way, now) for now in (1.0, 5.9)] == [False] * 2
+    assert proof.judge(under_way, 6.0) is (lost_after is not None)
     more = [under_way[0], {**under_way[1], "received": 4}]
-    assert [proof.judge(more, now) for now in (7.0, 7.1)] == [
-        Verdict.SETTLED,
-        Verdict.PROVEN,
-    ]
+    assert [proof.judge(more, now) for now in (7.0, 7.1)] == [False, True]
 
 
 def test_a_window_is_doubled_only_so_often() -> None:

@@ -7,7 +7,7 @@ operator that raises while it works is restarted within its process, by the same
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.execution.restarts import Restarts
@@ -48,11 +48,10 @@ class RestartPolicy(Watcher):
 class LiveRestarts(RestartPolicy):
     """Restarts by the operators' policies."""
 
-    def __init__(self, run: RunState, remains: LeftoverRecords, tell: Callable[[str, Supervised], None]) -> None:
-        """`tell` passes "away" and "back" on to all parts."""
+    def __init__(self, run: RunState, remains: LeftoverRecords, parts: Sequence[Watcher]) -> None:
+        """`parts`: all watchers of the run, which are notified of processes that go and come back."""
         super().__init__(run)
-        self._remains = remains
-        self._tell = tell
+        self._remains, self._parts = remains, parts
         self._pairs = tuple(pairs_of(run.graph, {label: process.plan for label, process in run.processes.items()}))
         self._attempts: dict[str, Restarts] = {}
         self._ended_streams: dict[str, str] = {}
@@ -92,7 +91,8 @@ class LiveRestarts(RestartPolicy):
             self._remains.hand_over(process.nodes)
         tell_consumers(run, process, absent=True)
         self._tell_producers(process)
-        self._tell("away", process)
+        for part in self._parts:
+            part.away(process)
         run.event(
             "restart",
             f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s",
@@ -173,7 +173,8 @@ class LiveRestarts(RestartPolicy):
             for each in run.working():
                 for name in each.nodes:
                     run.send(each, "lacks", operator=name)
-        self._tell("back", process)
+        for part in self._parts:
+            part.back(process)
         run.event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
 
     # News
