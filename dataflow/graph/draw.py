@@ -5,10 +5,8 @@ from __future__ import annotations
 from rich.text import Text
 from rich.tree import Tree
 
-from dataflow.graph.model import Graph, Node
-from dataflow.operator import InputPort
+from dataflow.graph.model import Graph, Node, input_text
 
-_KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 _ARROW = {"in": "-->", "sampled": "-.->", "batch": "==>"}
 
 
@@ -51,7 +49,7 @@ def _ports(graph: Graph, node: Node) -> list[Text]:
             Text.assemble(
                 ("in  ", "green"),
                 f"{name:<{width}}  ",
-                (_input_text(port), "yellow"),
+                (input_text(port), "yellow"),
                 " <- ",
                 (taken, "" if streams else "dim"),
             )
@@ -63,10 +61,6 @@ def _ports(graph: Graph, node: Node) -> list[Text]:
             Text.assemble(("out ", "blue"), f"{name:<{width}}  ", (" | ".join(made.types), "yellow"), (extra, "dim"))
         )
     return lines
-
-
-def _input_text(port: InputPort) -> str:
-    return f"{_KIND[port.kind]}[{port.type_text()}]"
 
 
 def mermaid(graph: Graph) -> str:

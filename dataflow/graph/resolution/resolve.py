@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
-from dataflow.graph.keys import canonical, has_wildcard, key_fault
-from dataflow.graph.model import Bundle, Graph, Node
+from dataflow.graph.expansion.wiring import read_pattern
+from dataflow.graph.keys import has_wildcard
+from dataflow.graph.model import INPUT_CLASS, Bundle, Graph, Node, input_text
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.resolution.flight import KEYS as FLIGHT_KEYS
-from dataflow.graph.resolution.flight import read_flight
-from dataflow.graph.resolution.network import read_network
 from dataflow.graph.resolution.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.resolution.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.resolution.presence import said
+from dataflow.graph.resolution.sections import FLIGHT_KEYS, read_flight, read_network
 from dataflow.graph.resolution.streams import Streams
 from dataflow.graph.sections import ON_FAILURE, PANELS, Record, Snapshots, View
 from dataflow.graph.yaml.fields import Fields
@@ -22,8 +21,6 @@ from dataflow.operator import InputPort, is_source
 from dataflow.sync.stamps import format_duration
 
 MAX_THREADS = 256
-
-_INPUT_WORD = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 
 
 class Resolver:
@@ -155,7 +152,7 @@ class Resolver:
         joined = len(draft.cls.spec.triggers) > 1 and not draft.cls.spec.merge and port.kind == "in"
         why = "a joined input takes one stream" if joined else "it takes one stream"
         listed = ", ".join(self.known.short(s, first.scope) for s in sorted(streams))
-        hint = "name one of them" if joined else f"name one, or declare the input {_INPUT_WORD[port.kind]}(many=True)"
+        hint = "name one of them" if joined else f"name one, or declare the input {INPUT_CLASS[port.kind]}(many=True)"
         if carriers := self.known.carriers(port.types, first.scope):
             hint += f"; {carriers}"
         self.problems.add(
@@ -257,34 +254,23 @@ class Resolver:
         table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep", "every"))
         if table is None:
             return View()
-        panels = []
-        for leaf in self.fields.texts(table.get("panels"), "panels"):
-            if (panel := self.fields.choice(leaf, "panels", {name: name for name in PANELS})) is not None:
-                panels.append(panel)
+        words = self.fields.texts(table.get("panels"), "panels")
+        panels = [self.fields.choice(leaf, "panels", {name: name for name in PANELS}) for leaf in words]
         layout = self.fields.text(table.get("layout"), "layout") or ""
         if layout and not layout.endswith(".rbl"):
-            self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")  # type: ignore[arg-type]
+            self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")
         hidden, kept = (self.topics(table.get(what), what) for what in ("hide", "keep"))
-        return View(hidden, tuple(panels), layout, kept, self.fields.duration(table.get("every"), "every"))
+        every = self.fields.duration(table.get("every"), "every")
+        return View(hidden, tuple(filter(None, panels)), layout, kept, every)
 
     def topics(self, tree: Tree | None, what: str) -> tuple[str, ...]:
         """The streams that a list of key expressions matches; each must match one at least."""
         found: set[str] = set()
-        namespace = self.expansion.namespace
         for leaf in self.fields.texts(tree, what):
-            text = leaf.value
-            absolute = text.startswith("/")
-            if fault := key_fault(text[1:] if absolute else text):
-                self.problems.add(leaf.place, f"{text!r} is no key expression: {fault}")
-                continue
-            key = canonical(text[1:] if absolute else f"{namespace}/{text}")
-            pattern = Pattern(text, key, leaf.place, namespace)
-            streams = self.known.match(pattern)
-            if not streams:
-                self.known.no_match(pattern, what, None)
-            found.update(streams)
+            pattern = read_pattern(leaf, self.expansion.namespace, self.problems)
+            if pattern is not None:
+                streams = self.known.match(pattern)
+                if not streams:
+                    self.known.no_match(pattern, what, None)
+                found.update(streams)
         return tuple(sorted(found))
-
-
-def input_text(port: InputPort) -> str:
-    return f"{_INPUT_WORD[port.kind]}[{port.type_text()}]"
