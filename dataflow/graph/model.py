@@ -292,9 +292,7 @@ class Graph:
             left_out=dict(data.get("left_out", {})),
             record=record_from_json(data["record"]),
             view=view_from_json(data["view"]),
-            network=Network(
-                **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
-            ),
+            network=Network(**{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])}),
             sources_bundle=Bundle(**{**bundle, "settings": tuple(bundle["settings"])}),
         )
 

@@ -243,20 +243,11 @@ operators:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (
-            ("picture: eye/image", "picture: eye/depth"),
-            "6:23: graph input 'front/picture' takes TestPicture, but",
-        ),
+        (("picture: eye/image", "picture: eye/depth"), "6:23: graph input 'front/picture' takes TestPicture, but"),
         (("picture: eye/image", "pictur: eye/image"), "outer.yaml:6:14: parts/front.yaml has no input 'pictur'"),
-        (
-            ("inputs: {picture: eye/image}", "machine: m"),
-            "5:10: front: input 'picture' (TestPicture) of parts",
-        ),
+        (("inputs: {picture: eye/image}", "machine: m"), "5:10: front: input 'picture' (TestPicture) of parts"),
         (("rate: 5", "rte: 5"), "outer.yaml:7:19: front (parts/front.yaml) has no parameter 'rte'"),
-        (
-            ("rate: 5", "rate: -5"),
-            "parts/front.yaml:6:58: front/camera: parameter 'rate': input should",
-        ),
+        (("rate: 5", "rate: -5"), "parts/front.yaml:6:58: front/camera: parameter 'rate': input should"),
         (("map: front/cloud", "map: front/clod"), "9:79: odometry.map: 'front/clod' is no stream of this graph"),
     ],
 )

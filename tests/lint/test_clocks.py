@@ -117,7 +117,7 @@ def test_the_sign_is_turned_where_the_contract_trusts_the_gyroscope() -> None:
 
 
 @pytest.mark.long
-def test_an_outage_of_the_wheels_is_a_gap_and_the_clocks_are_still_told() -> None:
+def test_wheel_outage_is_a_gap_and_clocks_are_still_estimated() -> None:
     found = report(wheels={"outages": [[10, 13]]})
     gaps = {f.stream: dict(f.values or {}) for f in found.findings if f.check == "gap"}
     assert set(gaps) == {"robot1/wheel_ticks", "robot1/wheel_odometry"}

@@ -103,7 +103,7 @@ def test_a_killed_process_does_nothing_more_and_a_frozen_one_goes_on_where_it_wa
     assert 8 <= seen["two"] <= 10
 
 
-def test_who_spins_is_named() -> None:
+def test_busy_loop_is_named() -> None:
     world = World(1, preempt=0.0)
 
     def spin() -> None:
@@ -228,9 +228,7 @@ RESTARTED = "restart: {max: 5, backoff: 10ms}"
 )
 @pytest.mark.parametrize("target", ["*", "", "relay", "@recorder"])
 @pytest.mark.parametrize("span", [pytest.param(6.0, marks=pytest.mark.long), 40.0])
-def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
-    target: str, span: float, policy: str, memory: Path
-) -> None:
+def test_pause_of_supervisor_and_others_kills_no_process(target: str, span: float, policy: str, memory: Path) -> None:
     pause = (Happening(0.05, "pause", target, {"span": span}),)
 
     result = check(replace(PLAIN, live=True, policy=policy, count=12, happenings=pause, work=0.05), memory)
@@ -241,10 +239,7 @@ def test_a_pause_of_the_supervisor_and_others_kills_and_blames_nobody(
 
 
 def test_a_process_that_stands_still_longer_than_the_pause_is_started_again(memory: Path) -> None:
-    happenings = (
-        Happening(0.15, "pause", "", {"span": 6.0}),
-        Happening(0.15, "freeze", "relay", {"span": 12.0}),
-    )
+    happenings = (Happening(0.15, "pause", "", {"span": 6.0}), Happening(0.15, "freeze", "relay", {"span": 12.0}))
     plain = replace(PLAIN, live=True, policy=RESTARTED, count=12, period=20_000_000)
 
     result = check(replace(plain, happenings=happenings), memory)
@@ -356,10 +351,7 @@ FOUND_BY = {
     "pause": replace(
         PLAIN,
         live=True,
-        happenings=(
-            Happening(0.01, "pause", "*", {"span": 6.0}),
-            Happening(0.02, "set", "relay", {"gain": 2.0}),
-        ),
+        happenings=(Happening(0.01, "pause", "*", {"span": 6.0}), Happening(0.02, "set", "relay", {"gain": 2.0})),
     ),
 }
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""
