@@ -44,22 +44,13 @@ def _ports(graph: Graph, node: Node) -> list[Text]:
     width = max((len(p) for p in (*node.inputs, *node.outputs)), default=0)
     for name, streams in node.inputs.items():
         port = node.input_port(name)
-        taken = ", ".join(graph.relative(s) for s in streams) or "(left out)"
-        lines.append(
-            Text.assemble(
-                ("in  ", "green"),
-                f"{name:<{width}}  ",
-                (input_text(port), "yellow"),
-                " <- ",
-                (taken, "" if streams else "dim"),
-            )
-        )
+        taken = (", ".join(graph.relative(s) for s in streams), "") if streams else ("(left out)", "dim")
+        typed = (input_text(port), "yellow")
+        lines.append(Text.assemble(("in  ", "green"), f"{name:<{width}}  ", typed, " <- ", taken))
     for name, stream in node.outputs.items():
         made = graph.streams[stream]
-        extra = "  static" if made.static else ""
-        lines.append(
-            Text.assemble(("out ", "blue"), f"{name:<{width}}  ", (" | ".join(made.types), "yellow"), (extra, "dim"))
-        )
+        typed, extra = (" | ".join(made.types), "yellow"), ("  static" if made.static else "", "dim")
+        lines.append(Text.assemble(("out ", "blue"), f"{name:<{width}}  ", typed, extra))
     return lines
 
 

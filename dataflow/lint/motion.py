@@ -259,25 +259,17 @@ def _check_pairs(motions: Mapping[str, Motion], mounts: Mounts) -> Iterator[Find
             if pair is None:
                 continue
             turned, seen, _ = pair
-            sizes = [np.linalg.norm(rows, axis=1)[:, None] for rows in (seen, turned)]
-            mistake = _mistake(
-                {
-                    "": (sizes[0], sizes[1]),
-                    "its angular velocity is in degrees, and rad/s is wanted": (sizes[0], sizes[1] * DEGREES),
-                },
-                TURNED,
-            )
-            if mistake:
-                yield Finding(
-                    "motion", name, "warning", f"its turning contradicts that of {other}; the two agree if {mistake}"
-                )
+            much, by_rate = (np.linalg.norm(rows, axis=1)[:, None] for rows in (seen, turned))
+            in_degrees = "its angular velocity is in degrees, and rad/s is wanted"
+            text = f"its turning contradicts that of {other}; the two agree if "
+            if mistake := _mistake({"": (much, by_rate), in_degrees: (much, by_rate * DEGREES)}, TURNED):
+                yield Finding("motion", name, "warning", text + mistake)
                 break
             connected = _way(gyro.body, mounts)[-1] == _way(body.body, mounts)[-1]
             mistake = _mistake(_mounted(gyro.body, body.body, mounts, *pair), TURNED) if connected else ""
             if mistake and mistake not in named:
                 named.add(mistake)
-                text = f"its turning contradicts that of {other}; the two agree if {mistake}"
-                yield Finding("motion", name, "warning", text)
+                yield Finding("motion", name, "warning", text + mistake)
 
 
 def _pair(gyro: Motion, body: Motion) -> tuple[F64, F64, F64] | None:

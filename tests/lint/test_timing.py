@@ -55,16 +55,9 @@ def test_streams_that_begin_late_or_end_early_are_named() -> None:
 
 
 def test_a_contract_bounds_rates_and_gaps_and_names_streams() -> None:
-    terms = Contract.model_validate(
-        {
-            "streams": {
-                "imu": {"rate": [95, 105]},
-                "camera/*": {"rate": [9, 11], "max_gap": "250ms"},
-                "gnss": {},
-                "radio": {"optional": True},
-            }
-        }
-    )
+    imu, camera = {"rate": [95, 105]}, {"rate": [9, 11], "max_gap": "250ms"}
+    streams = {"imu": imu, "camera/*": camera, "gnss": {}, "radio": {"optional": True}}
+    terms = Contract.model_validate({"streams": streams})
     stamps = {"robot1/imu": every(0.02), "robot1/camera/left": every(0.1), "robot1/camera/right": every(0.1)}
     stamps["robot1/camera/right"] = [s for s in stamps["robot1/camera/right"] if (s - BEGIN) // 10**8 not in (50, 51)]
     assert sorted(findings(stamps, terms)) == [

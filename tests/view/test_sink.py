@@ -268,17 +268,8 @@ def test_curves_get_their_view_when_they_are_first_drawn(late: bool, tmp_path: P
 @pytest.mark.parametrize("placed", [False, True])
 def test_tracks_without_places_and_a_status_without_figures_get_no_view(placed: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.rrd"
-    tracks = Tracks(
-        stamp=STAMP,
-        frame="c",
-        boxes=[[0, 0, 2, 2]],
-        ids=[1],
-        states=[1],
-        scores=[1],
-        class_ids=[0],
-        ages=[3],
-        unseen=[0],
-    )
+    one = {"ids": [1], "states": [1], "scores": [1], "class_ids": [0], "ages": [3], "unseen": [0]}
+    tracks = Tracks(stamp=STAMP, frame="c", boxes=[[0, 0, 2, 2]], **one)
     status = Diagnostics(stamp=STAMP, names=["n"], levels=[0], messages=["ok"])
     if placed:
         tracks = tracks.replace(positions=[[1, 0, 0]])
@@ -358,10 +349,7 @@ def test_a_stream_that_is_not_shown_wins_no_frame_from_one_that_is_and_brings_no
         for k in range(3):
             sink.log("wheels", placed_by("wheel_odom", k, 9.0))
             sink.log("scan", scan(STAMP + k))
-            sink.log(
-                "shown",
-                Pose(stamp=STAMP + k, frame="world", child_frame="lidar", position=[2, 0, 0], orientation=[0, 0, 0, 1]),
-            )
+            sink.log("shown", placed_by("world", k, 2.0))
     found = rows(path)
     assert {row.values[0] for row in at(found, "/frames/lidar", "Transform3D:parent_frame")} == {"world"}
     assert not [row for row in found if row.entity == "/frames/wheel_odom"]

@@ -247,12 +247,9 @@ class Expander:
                     carried = replace(carried, value=carried.value.removesuffix(OPTIONAL).strip())
                 declared[name] = (entry.key.place, self.message_type(carried, name))
         if scope.use is None:
+            hint = "a graph with inputs runs inside another graph: name this file there with 'use:'"
             for name, (place, _) in declared.items():
-                self.problems.add(
-                    place,
-                    f"graph input {name!r} is bound to nothing",
-                    "a graph with inputs runs inside another graph: name this file there with 'use:'",
-                )
+                self.problems.add(place, f"graph input {name!r} is bound to nothing", hint)
             return {name: GraphInput((), kind, place) for name, (place, kind) in declared.items()}
         for name, (place, _) in scope.bindings.items():
             if name not in declared:
@@ -270,12 +267,8 @@ class Expander:
                 choices = (Choice((), Absence(reason, scope.prefix)),)
             elif bound is None:
                 wanted = f" ({kind.SCHEMA})" if kind else ""
-                self.problems.add(
-                    scope.use,
-                    f"{scope.prefix[:-1]}: input {name!r}{wanted} of {scope.shown} is not given",
-                    f"add 'inputs: {{{name}: ...}}'",
-                    [(place, "declared here")],
-                )
+                text = f"{scope.prefix[:-1]}: input {name!r}{wanted} of {scope.shown} is not given"
+                self.problems.add(scope.use, text, f"add 'inputs: {{{name}: ...}}'", [(place, "declared here")])
             inputs[name] = GraphInput(choices, kind, place)
             self.out.graph_inputs.append((f"{scope.prefix}{name}", inputs[name]))
         return inputs

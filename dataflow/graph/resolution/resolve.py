@@ -73,12 +73,9 @@ class Resolver:
     def check_graph_input(self, name: str, declared: GraphInput, pattern: Pattern, stream: str) -> None:
         assert declared.type is not None
         if not all(issubclass(t, declared.type) for t in self.types[stream]):
-            self.problems.add(
-                pattern.place,
-                f"graph input {name!r} takes {declared.type.SCHEMA}, but {self.known.told(stream, pattern.scope)}",
-                self.known.carriers((declared.type,), pattern.scope),
-                [(declared.place, "declared here")],
-            )
+            text = f"graph input {name!r} takes {declared.type.SCHEMA}, but {self.known.told(stream, pattern.scope)}"
+            hint = self.known.carriers((declared.type,), pattern.scope)
+            self.problems.add(pattern.place, text, hint, [(declared.place, "declared here")])
 
     # -- one operator's inputs -----------------------------------------------------------------------------------
 
@@ -96,12 +93,9 @@ class Resolver:
                 continue
             wired.inputs[port.name] = ()
             if port.kind != "sampled" or port.required:
-                self.problems.add(
-                    draft.inputs_place,
-                    f"{draft.name}: input {port.name!r} ({input_text(port)}) is not wired",
-                    self.known.carriers(port.types, self.known.scope_of(draft))
-                    or f"no stream carries {port.type_text()}",
-                )
+                text = f"{draft.name}: input {port.name!r} ({input_text(port)}) is not wired"
+                hint = self.known.carriers(port.types, self.known.scope_of(draft))
+                self.problems.add(draft.inputs_place, text, hint or f"no stream carries {port.type_text()}")
         if spec.every is not None and not is_source(draft.cls):
             self.check_ticks(wired)
         return wired
@@ -132,20 +126,15 @@ class Resolver:
     def check_stream(self, what: str, port: InputPort, pattern: Pattern, stream: str) -> None:
         """The stream's type, and that a static stream is only sampled."""
         if not port.accepts(self.types[stream]):
-            self.problems.add(
-                pattern.place,
-                f"{what} takes {port.type_text()}, but {self.known.told(stream, pattern.scope)}",
-                self.known.carriers(port.types, pattern.scope),
-                self.known.via(pattern),
-            )
+            text = f"{what} takes {port.type_text()}, but {self.known.told(stream, pattern.scope)}"
+            hint = self.known.carriers(port.types, pattern.scope)
         elif self.streams[stream].static and port.kind != "sampled":
-            self.problems.add(
-                pattern.place,
-                f"{what}: {self.known.short(stream, pattern.scope)!r} is static (one message, valid at all times), "
-                f"which {'cannot trigger' if port.kind == 'in' else 'makes no batch'}",
-                f"the operator should declare it {port.name}: Sampled[{port.type_text()}]",
-                self.known.via(pattern),
-            )
+            text = f"{what}: {self.known.short(stream, pattern.scope)!r} is static (one message, valid at all times), "
+            text += f"which {'cannot trigger' if port.kind == 'in' else 'makes no batch'}"
+            hint = f"the operator should declare it {port.name}: Sampled[{port.type_text()}]"
+        else:
+            return
+        self.problems.add(pattern.place, text, hint, self.known.via(pattern))
 
     def too_many(self, draft: Draft, port: InputPort, streams: Mapping[str, Pattern]) -> None:
         first = next(iter(streams.values()))
@@ -155,12 +144,8 @@ class Resolver:
         hint = "name one of them" if joined else f"name one, or declare the input {INPUT_CLASS[port.kind]}(many=True)"
         if carriers := self.known.carriers(port.types, first.scope):
             hint += f"; {carriers}"
-        self.problems.add(
-            first.place,
-            f"{draft.name}.{port.name}: {why}, but {len(streams)} match: {listed}",
-            hint,
-            self.known.via(first),
-        )
+        text = f"{draft.name}.{port.name}: {why}, but {len(streams)} match: {listed}"
+        self.problems.add(first.place, text, hint, self.known.via(first))
 
     def check_ticks(self, wired: Wired) -> None:
         """Ticks begin and end with an input that is neither static nor fed back."""
@@ -172,12 +157,9 @@ class Resolver:
         for name, port in spec.inputs.items():
             if not port.before and any(not self.streams[s].static for s in wired.inputs[name]):
                 return
-        self.problems.add(
-            draft.inputs_place,
-            f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
-            "'before': the beginning and the end of ticks are unknown",
-            "wire an input to a stream that is neither",
-        )
+        text = f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
+        text += "'before': the beginning and the end of ticks are unknown"
+        self.problems.add(draft.inputs_place, text, "wire an input to a stream that is neither")
 
     # -- the graph as a whole ------------------------------------------------------------------------------------
 
@@ -191,12 +173,10 @@ class Resolver:
                 mine, other = getattr(draft, key), getattr(first, key)
                 here, there = (leaf.value if leaf else None for leaf in (mine, other))
                 if here != there:
-                    self.problems.add(
-                        (mine or other or draft.process or Leaf(None, draft.place)).place,
-                        f"process {label!r} is {words[0]} two {words[1]}: {first.name} {words[0]} "
-                        f"{there or 'this one'}, {draft.name} {words[0]} {here or 'this one'}",
-                        f"give them the same '{key}:', or different 'process:' labels",
-                    )
+                    at = (mine or other or draft.process or draft).place
+                    text = f"process {label!r} is {words[0]} two {words[1]}: {first.name} {words[0]} "
+                    text += f"{there or 'this one'}, {draft.name} {words[0]} {here or 'this one'}"
+                    self.problems.add(at, text, f"give them the same '{key}:', or different 'process:' labels")
 
     # -- the resolved parts --------------------------------------------------------------------------------------
 

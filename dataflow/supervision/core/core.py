@@ -234,13 +234,8 @@ class Core:
             for part in self._parts:
                 part.closing()
         run.command(Withdraw())
-        self._closing = Closing(
-            run,
-            outcome="interrupted" if self._interrupted else "complete",
-            failure=failure,
-            at_once=self._stops > 1,
-            hand_over=self._restarts.hand_over_all,
-        )
+        outcome, hand_over = "interrupted" if self._interrupted else "complete", self._restarts.hand_over_all
+        self._closing = Closing(run, outcome=outcome, failure=failure, at_once=self._stops > 1, hand_over=hand_over)
 
     def _over(self, closing: Closing) -> None:
         run = self.run

@@ -93,13 +93,8 @@ class LiveRestarts(RestartPolicy):
         self._tell_producers(process)
         for part in self._parts:
             part.away(process)
-        run.event(
-            "restart",
-            f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s",
-            operators=list(process.nodes),
-            cause=how,
-            **failed_in,
-        )
+        text = f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s"
+        run.event("restart", text, operators=list(process.nodes), cause=how, **failed_in)
 
     def _tell_producers(self, process: Supervised) -> None:
         """Notifies the producers of a process that it no longer takes their messages."""
@@ -185,16 +180,10 @@ class LiveRestarts(RestartPolicy):
             case "restarting":
                 name = fields["operator"]
                 run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
-                where = f" ({fields['where']})" if fields["where"] else ""
-                run.event(
-                    "restart",
-                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}{where}; "
-                    f"made anew in {fields['pause']:.2g} s",
-                    operators=[name],
-                    cause=fields["summary"],
-                    where=fields["where"],
-                    traceback=fields["traceback"],
-                )
+                cause, where, traceback = fields["summary"], fields["where"], fields["traceback"]
+                text = f"operator {name!r} failed in {fields['when']}: {cause}{f' ({where})' if where else ''}"
+                text += f"; made anew in {fields['pause']:.2g} s"
+                run.event("restart", text, operators=[name], cause=cause, where=where, traceback=traceback)
             case "reloaded":
                 name = fields["operator"]
                 which = "new code" if fields["changed"] else "the code that it had, whose files are as they were,"
@@ -205,14 +194,8 @@ class LiveRestarts(RestartPolicy):
                 self._ended_streams[fields["stream"]] = fields["reason"]
             case "gap":
                 stream, first, following = fields["stream"], fields["first"], fields["following"]
-                run.event(
-                    "gap",
-                    f"{process.label} did not get {stream} {first} to {following - 1}",
-                    taker=process.label,
-                    stream=stream,
-                    first=first,
-                    following=following,
-                )
+                text = f"{process.label} did not get {stream} {first} to {following - 1}"
+                run.event("gap", text, taker=process.label, stream=stream, first=first, following=following)
             case "jumped":
                 name, stamp = fields["operator"], fields["stamp"]
                 run.event("clock_jump", f"the clock of {name!r} jumped back to {stamp}", operator=name, stamp=stamp)
