@@ -1,4 +1,4 @@
-"""What is looked at, anything that has streams with timestamps and messages, and what is found there."""
+"""Inputs of the checks, anything that has streams with timestamps and messages, and the findings there."""
 
 from __future__ import annotations
 

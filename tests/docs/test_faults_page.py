@@ -39,15 +39,15 @@ SHOWN_BY = {
     """,
     "an operator is slow": "a_slow_operator_drops_by_its_policy_and_holds_up_nobody",
     "a process gives no sign of life (stopped, swapped out)": """
-        a_stopped_process_is_killed_and_restarted_by_its_policy
-        a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back
+        a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy
+        stopped_consumer_is_not_waited_for_and_starts_a_new_backlog
         what_did_not_reach_a_consumer_is_counted_against_it
     """,
     "a process lives and takes no messages (a call that holds the interpreter)": """
         a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted
     """,
     "the whole run or its supervisor pauses (`docker pause`, a suspended laptop, heavy swapping)": """
-        a_pause_of_the_supervisor_and_others_kills_and_blames_nobody
+        pause_of_supervisor_and_others_kills_no_process
         a_time_in_which_the_process_was_stopped_is_no_part_of_a_call
     """,
     "the process that starts the others (the nursery) is killed": """

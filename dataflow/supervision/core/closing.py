@@ -89,7 +89,7 @@ class Closing:
         return (LEAVE_AT_ONCE if self._at_once else LEAVE_TIMEOUT) / (1 if self._sinks else 2)
 
     def _begin(self, *, sinks: bool) -> None:
-        """Tells the sinks, or all others, to leave."""
+        """Asks the sinks, or all others, to leave."""
         run, self._sinks = self.run, sinks
         outcome = self.outcome if self.failure is None else f"failed: {str(self.failure).splitlines()[0]}"
         for process in run.processes.values():
