@@ -7,12 +7,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from dataflow.chaos.kinds import SECOND
 from dataflow.messages.base import Message
 from dataflow.sync import Firing
 
 Step = Mapping[str, Message]
 
+SECOND = 1_000_000_000
+TO_OPERATORS = ("raise", "hang", "slow", "leak")
+TO_SOURCES = ("stop", "flood", "jump", "past")
+TO_PROCESSES = ("kill", "freeze")
+"""Kinds of faults, by what they are done to."""
 HANG = 3600.0
 """Seconds that a planned hang lasts, unless it is ended."""
 

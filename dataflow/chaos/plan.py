@@ -7,6 +7,7 @@ run records it, and `dataflow verify` repeats the run, faults included.
 
 from __future__ import annotations
 
+import heapq
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 
-from dataflow.chaos.kinds import SECOND, TO_OPERATORS, TO_SOURCES
+from dataflow.chaos.faults import SECOND, TO_OPERATORS, TO_SOURCES
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
 from dataflow.graph.yaml.document import parse
@@ -182,30 +183,21 @@ def _kinds() -> list[str]:
 
 
 def _check(entry: Any, graph: Graph, where: tuple[str | int, ...]) -> None:
-    node = graph.nodes.get(entry.operator)
-    at_operator = (*where, "operator")
+    node, name, at_operator = graph.nodes.get(entry.operator), entry.operator, (*where, "operator")
     if node is None:
-        raise ChaosError(
-            f"no operator {entry.operator!r}", at_operator, did_you_mean(entry.operator, graph.nodes, "there are")
-        )
+        raise ChaosError(f"no operator {name!r}", at_operator, did_you_mean(name, graph.nodes, "there are"))
     if entry.kind in TO_SOURCES and not node.source:
         sources = ", ".join(n.name for n in graph.sources())
-        raise ChaosError(f"{entry.kind!r} is for sources ({sources}); {entry.operator!r} is none", at_operator)
+        raise ChaosError(f"{entry.kind!r} is for sources ({sources}); {name!r} is none", at_operator)
     if entry.kind in TO_OPERATORS and node.source:
-        raise ChaosError(f"{entry.kind!r} is for operators with inputs; {entry.operator!r} is a source", at_operator)
+        raise ChaosError(f"{entry.kind!r} is for operators with inputs; {name!r} is a source", at_operator)
     if entry.kind == "param":
         _check_parameter(entry, node, where)
-    needs_restart = entry.kind in ("kill", "raise", "hang")
-    if needs_restart and node.live.restart.max < 1:
-        raise ChaosError(
-            f"{entry.kind!r} would end the run",
-            at_operator,
-            f"give {entry.operator!r} a restart policy, live: {{restart: {{max: 100, backoff: 100ms}}}}",
-        )
+    if entry.kind in ("kill", "raise", "hang") and node.live.restart.max < 1:
+        hint = f"give {name!r} a restart policy, live: {{restart: {{max: 100, backoff: 100ms}}}}"
+        raise ChaosError(f"{entry.kind!r} would end the run", at_operator, hint)
     if entry.kind == "hang" and node.live.deadline is None:
-        raise ChaosError(
-            f"nothing would notice that {entry.operator!r} hangs", at_operator, "give it live: {deadline: 1s}"
-        )
+        raise ChaosError(f"nothing would notice that {name!r} hangs", at_operator, "give it live: {deadline: 1s}")
 
 
 def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) -> None:
@@ -216,11 +208,8 @@ def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) ->
         hint = did_you_mean(entry.name, able, "those that can change while the graph runs")
         raise ChaosError(f"{entry.operator!r} has no parameter {entry.name!r}", (*where, "name"), hint)
     if entry.name not in able:
-        raise ChaosError(
-            f"{entry.name!r} of {entry.operator!r} cannot change while the graph runs",
-            (*where, "name"),
-            f"those that can: {', '.join(able) or 'none'}",
-        )
+        text = f"{entry.name!r} of {entry.operator!r} cannot change while the graph runs"
+        raise ChaosError(text, (*where, "name"), f"those that can: {', '.join(able) or 'none'}")
     for k, value in enumerate(entry.values):
         try:
             validate_parameters(node.operator, {**node.params, entry.name: value})
@@ -230,8 +219,6 @@ def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) ->
 
 def _merged(plan: _Plan, seed: int) -> Iterator[Fault]:
     """All entries' faults by time; each entry draws from a separate generator, so that one does not move another."""
-    import heapq
-
     entries = [_times(entry, random.Random(f"{seed} {k}")) for k, entry in enumerate(plan.faults)]
     return iter(heapq.merge(*entries, key=lambda fault: fault.at))
 
@@ -249,9 +236,7 @@ def _times(entry: Any, rng: random.Random) -> Iterator[Fault]:
     if entry.at is not None:
         yield fault(entry.at / SECOND)
         return
-    at = 0.0
-    while True:
-        at += rng.expovariate(SECOND / entry.every)
-        if entry.until is not None and at > entry.until / SECOND:
-            return
+    at = rng.expovariate(SECOND / entry.every)
+    while entry.until is None or at <= entry.until / SECOND:
         yield fault(at)
+        at += rng.expovariate(SECOND / entry.every)

@@ -22,7 +22,7 @@ from rich.text import Text
 
 from dataflow.extras import missing_extra
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
-from dataflow.graph.model import current_path
+from dataflow.graph.model import INPUT_CLASS, current_path
 from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_source, is_tunable, state_hints
 from dataflow.sync.stamps import format_duration, parse_duration
@@ -30,8 +30,6 @@ from dataflow.sync.stamps import format_duration, parse_duration
 ENTRY_POINTS = "dataflow.operators"
 """The entry-point group by which a package advertises a module or package of operators."""
 BUILT_IN = ("operators",)
-
-_KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +313,7 @@ def page(described: Described) -> RenderableType:
     parts.append(Text(f"fires {fires(cls)}", "dim"))
     ports = _table("port", "kind", "type", "")
     for port in spec.inputs.values():
-        ports.add_row(port.name, f"in  {_KIND[port.kind]}", port.type_text(), _notes(input_notes(port), port.doc))
+        ports.add_row(port.name, f"in  {INPUT_CLASS[port.kind]}", port.type_text(), _notes(input_notes(port), port.doc))
     for out in spec.outputs.values():
         ports.add_row(out.name, "out", out.type_text(), _notes(output_notes(out), out.doc))
     parts += [Text(), ports]
@@ -325,12 +323,7 @@ def page(described: Described) -> RenderableType:
         for row in rows:
             unit = f" {row['unit']}" if row["unit"] else ""
             default = "must be given" if row["required"] else json.dumps(row["default"], ensure_ascii=False) + unit
-            table.add_row(
-                row["name"],
-                Text(row["type"]),
-                Text(default),
-                _notes(parameter_notes(row), row["doc"]),
-            )
+            table.add_row(row["name"], Text(row["type"]), Text(default), _notes(parameter_notes(row), row["doc"]))
         parts += [Text(), table]
     if fields := state_fields(cls):
         table = _table("state", "type", "")

@@ -5,10 +5,8 @@ from __future__ import annotations
 from rich.text import Text
 from rich.tree import Tree
 
-from dataflow.graph.model import Graph, Node
-from dataflow.operator import InputPort
+from dataflow.graph.model import Graph, Node, input_text
 
-_KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 _ARROW = {"in": "-->", "sampled": "-.->", "batch": "==>"}
 
 
@@ -46,27 +44,14 @@ def _ports(graph: Graph, node: Node) -> list[Text]:
     width = max((len(p) for p in (*node.inputs, *node.outputs)), default=0)
     for name, streams in node.inputs.items():
         port = node.input_port(name)
-        taken = ", ".join(graph.relative(s) for s in streams) or "(left out)"
-        lines.append(
-            Text.assemble(
-                ("in  ", "green"),
-                f"{name:<{width}}  ",
-                (_input_text(port), "yellow"),
-                " <- ",
-                (taken, "" if streams else "dim"),
-            )
-        )
+        taken = (", ".join(graph.relative(s) for s in streams), "") if streams else ("(left out)", "dim")
+        typed = (input_text(port), "yellow")
+        lines.append(Text.assemble(("in  ", "green"), f"{name:<{width}}  ", typed, " <- ", taken))
     for name, stream in node.outputs.items():
         made = graph.streams[stream]
-        extra = "  static" if made.static else ""
-        lines.append(
-            Text.assemble(("out ", "blue"), f"{name:<{width}}  ", (" | ".join(made.types), "yellow"), (extra, "dim"))
-        )
+        typed, extra = (" | ".join(made.types), "yellow"), ("  static" if made.static else "", "dim")
+        lines.append(Text.assemble(("out ", "blue"), f"{name:<{width}}  ", typed, extra))
     return lines
-
-
-def _input_text(port: InputPort) -> str:
-    return f"{_KIND[port.kind]}[{port.type_text()}]"
 
 
 def mermaid(graph: Graph) -> str:

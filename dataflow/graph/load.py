@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from dataflow.graph.expansion.expand import Expander
@@ -27,16 +28,12 @@ def load_graph(path: str | Path, *, settings: Sequence[str] = (), live: bool = F
     Imports the operators it names, also from modules beside the file (`dataflow.graph.search`). Raises `GraphError`
     with everything that is wrong.
     """
-    file = Path(path)
-    return _load(
-        file.name,
-        _reader(file.parent),
-        os.environ.get,
-        lambda: file.parent.as_posix(),
-        settings,
-        lambda key: _shown(file.parent, key),
-        live,
-    )
+    folder = Path(path).parent
+
+    def shown(key: str) -> str:
+        return os.path.normpath(folder / key)
+
+    return _load(Path(path).name, _reader(folder), os.environ.get, folder.as_posix, settings, shown, live)
 
 
 def load_text(
@@ -78,14 +75,8 @@ def load_bundle(bundle: str) -> Graph:
         problems.add(Place("bundle", 1, 1), f"not a graph bundle: {type(error).__name__}: {error}")
         problems.check()
         raise AssertionError from error
-    return _load(
-        packed.file,
-        lambda key: _from(packed.files, key),
-        packed.environment.get,
-        lambda: packed.folder,
-        packed.settings,
-        str,
-    )
+    read = partial(_from, packed.files)
+    return _load(packed.file, read, packed.environment.get, lambda: packed.folder, packed.settings, str)
 
 
 def _load(
@@ -119,9 +110,8 @@ def _load(
         problems.check()
         raise AssertionError("a graph without a shape has a problem")
     Presence(expansion, problems).settle()
-    graph = Resolver(expansion, problems, live).resolve(
-        Bundle(file, texts, tuple(settings), environment, "".join(folders))
-    )
+    bundle = Bundle(file, texts, tuple(settings), environment, "".join(folders))
+    graph = Resolver(expansion, problems, live).resolve(bundle)
     problems.check()
     return graph
 
@@ -147,7 +137,3 @@ def _from(texts: Mapping[str, str], key: str) -> str:
     if key not in texts:
         raise FileNotFoundError(2, f"not among {', '.join(texts)}")
     return texts[key]
-
-
-def _shown(folder: Path, key: str) -> str:
-    return os.path.normpath(folder / key)

@@ -49,23 +49,16 @@ def find_operator(use: str) -> type[Operator] | NotFound:
     except (Exception, SystemExit) as error:  # a package may import what it offers only now
         return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _mend(error, module_name))
     if found is None:
-        return NotFound(
-            f"module {module_name!r} has no operator {name!r}",
-            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
-            deleted=True,
-        )
-    if not (isinstance(found, type) and issubclass(found, Operator)):
+        message = f"module {module_name!r} has no operator {name!r}"
+    elif not (isinstance(found, type) and issubclass(found, Operator)):
         what = f"the class {name}" if isinstance(found, type) else f"a {type(found).__name__}"
-        return NotFound(
-            f"{use!r} is {what}, not an Operator",
-            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
-        )
-    if not is_concrete(found):
-        return NotFound(
-            f"{use!r} is abstract: it declares no ports",
-            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
-        )
-    return found
+        message = f"{use!r} is {what}, not an Operator"
+    elif not is_concrete(found):
+        message = f"{use!r} is abstract: it declares no ports"
+    else:
+        return found
+    hint = did_you_mean(name, operator_names(module), f"operators in {module_name!r}")
+    return NotFound(message, hint, deleted=found is None)
 
 
 def import_module(name: str) -> ModuleType | NotFound:

@@ -36,6 +36,15 @@ StalePolicy = Literal["use", "drop"]
 Placement = Literal["graph", "one_process", "process_each"]
 
 
+INPUT_CLASS = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
+"""By kind of an input, the class that declares it."""
+
+
+def input_text(port: InputPort) -> str:
+    """Returns an input as it is declared, such as `In[Image]`."""
+    return f"{INPUT_CLASS[port.kind]}[{port.type_text()}]"
+
+
 class OperatorImportError(ImportError):
     """An operator cannot be imported from its path; the message names the part that fails, and why."""
 
@@ -283,9 +292,7 @@ class Graph:
             left_out=dict(data.get("left_out", {})),
             record=record_from_json(data["record"]),
             view=view_from_json(data["view"]),
-            network=Network(
-                **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
-            ),
+            network=Network(**{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])}),
             sources_bundle=Bundle(**{**bundle, "settings": tuple(bundle["settings"])}),
         )
 

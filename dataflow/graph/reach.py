@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Set
 
 from dataflow.graph.model import Graph
 
 
 def upstream(graph: Graph, names: Iterable[str]) -> set[str]:
     """Returns the operators on which some depend, directly or not; one of these itself only where it is in a loop."""
-    return _reached(names, lambda name: _makers(graph, graph.nodes[name].taken))
+    return reached(names, lambda name: _makers(graph, graph.nodes[name].taken))
 
 
 def downstream(graph: Graph, names: Iterable[str]) -> set[str]:
@@ -17,7 +17,7 @@ def downstream(graph: Graph, names: Iterable[str]) -> set[str]:
     takers: dict[str, set[str]] = {name: set() for name in graph.nodes}
     for edge in graph.edges():
         takers[edge.producer].add(edge.consumer)
-    return _reached(names, takers.__getitem__)
+    return reached(names, takers.__getitem__)
 
 
 def with_makers(held: Collection[str], graph: Graph, chosen: Collection[str]) -> set[str]:
@@ -27,14 +27,15 @@ def with_makers(held: Collection[str], graph: Graph, chosen: Collection[str]) ->
         made = _makers(graph, graph.nodes[name].taken.difference(held))
         return {maker for maker in made if not (graph.nodes[maker].source or graph.nodes[maker].external)}
 
-    return {*chosen} | _reached(chosen, more)
+    return {*chosen} | reached(chosen, more)
 
 
 def _makers(graph: Graph, streams: Iterable[str]) -> set[str]:
     return {graph.streams[stream].node for stream in streams}
 
 
-def _reached(names: Iterable[str], more: Callable[[str], set[str]]) -> set[str]:
+def reached(names: Iterable[str], more: Callable[[str], Set[str]]) -> set[str]:
+    """Returns what `more` leads to from some names on; one of these itself only where something leads back to it."""
     found, left = set[str](), list(names)
     while left:
         new = more(left.pop()) - found

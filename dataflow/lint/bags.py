@@ -1,4 +1,4 @@
-"""A bag as material: topics as streams, with the timestamps in their headers as they are, nothing repaired."""
+"""A bag that is looked at: topics as streams, with the timestamps in their headers as they are, nothing repaired."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from dataflow.interop.bag import Bag, is_static, shortfalls
 from dataflow.interop.playing import readings_of
 from dataflow.interop.topics import Reading, is_known
 from dataflow.interop.transform_sets import places_of
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Stamps, StreamFacts
+from dataflow.lint.inputs import Finding, Stamps, StreamFacts
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording import RecordingError
 
 
-class BagMaterial:
+class BagInput:
     """An open bag. A message whose header has no time counts with the time at which it was recorded."""
 
     namespace = ""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16, Message
 
 _TYPES = {cls.SCHEMA for cls in (CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Image16)}
 
 
-def check_cameras(material: Material) -> Iterator[Finding]:
+def check_cameras(data: LintInput) -> Iterator[Finding]:
     """Looks at the first image and calibration of each stream; one frame is taken for one camera.
 
     Images of several sizes in one frame are right where each size has a calibration. An image and the `camera_info`
@@ -19,10 +18,10 @@ def check_cameras(material: Material) -> Iterator[Finding]:
     """
     images: dict[str, tuple[str, int, int]] = {}
     infos: dict[str, dict[str, CameraInfo]] = {}
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if not (facts.readable and facts.count and facts.type in _TYPES):
             continue
-        message = next(iter(material.messages(name)), None)
+        message = next(iter(data.messages(name)), None)
         if isinstance(message, CameraInfo):
             infos.setdefault(message.frame, {})[name] = message
         elif message is not None and (size := _size(message)) is not None:

@@ -13,7 +13,7 @@ from ruamel.yaml.error import YAMLError
 
 from dataflow.graph.keys import as_expression, canonical, key_fault, matching
 from dataflow.graph.problems import did_you_mean
-from dataflow.lint.material import StreamFacts
+from dataflow.lint.inputs import StreamFacts
 from dataflow.lint.timing import Timing
 from dataflow.sync.stamps import parse_duration
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from dataflow.lint.finding import Finding
+from dataflow.lint.inputs import Finding
 from dataflow.messages import Message, Odometry, Pose, Transforms
 
 

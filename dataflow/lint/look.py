@@ -9,15 +9,14 @@ from typing import Any
 from dataflow.lint.cameras import check_cameras
 from dataflow.lint.clocks import NONE, ClockDifference, agreed, clock_difference
 from dataflow.lint.contract import Contract, StreamTerms, means
-from dataflow.lint.finding import Finding
 from dataflow.lint.frames import FrameTree, check_frames
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.lint.motion import check_motion
 from dataflow.lint.publishers import check_publishers
 from dataflow.lint.quantities import check_quantities
 from dataflow.lint.readings import check_readings
 from dataflow.lint.timing import Timing, check_ends, check_gaps, check_order, check_unit, timing_of
-from dataflow.lint.turning import READERS, Turning, turning_of
+from dataflow.lint.turning import Turning, turning_of
 
 SIGMAS = 3.0
 """Standard deviations that a clock has to be off by, besides what is tolerated."""
@@ -62,39 +61,39 @@ class Report:
         }
 
 
-def lint(material: Material, contract: Contract | None = None, *, clocks: bool = True) -> Report:
+def lint(data: LintInput, contract: Contract | None = None, *, clocks: bool = True) -> Report:
     """Looks at everything. `clocks` False leaves clocks and motion out, which take all messages."""
     terms = contract or Contract()
     report = Report()
-    report.findings += material.file_findings(whole=clocks)
-    for name, facts in material.streams.items():
+    report.findings += data.file_findings(whole=clocks)
+    for name, facts in data.streams.items():
         if facts.count and not facts.static:
-            stamps = material.stamps(name)
+            stamps = data.stamps(name)
             timing = timing_of(stamps)
             if timing is None:
                 text = f"{facts.count:,} messages are promised, and none is there"
                 report.findings.append(Finding("missing", name, "error", text))
                 continue
             report.timings[name] = timing
-            wanted = terms.terms_of(name, material.namespace)
+            wanted = terms.terms_of(name, data.namespace)
             if facts.type != "Transforms":  # several may publish transforms on one topic, each by its own clock
                 report.findings += check_order(name, stamps)
             report.findings += check_unit(name, timing)
             report.findings += check_gaps(name, stamps, timing, None if wanted is None else wanted.max_gap)
     report.findings += check_ends(report.timings)
-    report.findings += check_quantities(material, report.timings)
-    report.findings += check_readings(material)
-    report.findings += check_cameras(material)
-    report.findings += check_publishers(material)
-    tree = _frames_of(material)
+    report.findings += check_quantities(data, report.timings)
+    report.findings += check_readings(data)
+    report.findings += check_cameras(data)
+    report.findings += check_publishers(data)
+    tree = _frames_of(data)
     report.findings += check_frames(tree, terms.frames.root, terms.frames.required)
     report.root = tree.roots()[0] if tree.parents else None
-    report.findings += _kept(material, terms, report.timings)
+    report.findings += _kept(data, terms, report.timings)
     if clocks:
-        report.findings += check_motion(material)
-        report.reference, report.clocks = compare_clocks(material, report.timings, terms)
+        report.findings += check_motion(data)
+        report.reference, report.clocks = compare_clocks(data, report.timings, terms)
         report.findings += check_clocks(report, terms)
-    report.findings = [f for f in report.findings if not _accepted(f, terms, material.namespace)]
+    report.findings = [f for f in report.findings if not _accepted(f, terms, data.namespace)]
     report.findings.sort(key=lambda f: ("error", "warning", "note").index(f.severity))
     return report
 
@@ -104,33 +103,33 @@ def _accepted(finding: Finding, terms: Contract, namespace: str) -> bool:
     return wanted is not None and finding.check in wanted.allow
 
 
-def _frames_of(material: Material) -> FrameTree:
+def _frames_of(data: LintInput) -> FrameTree:
     """Takes all transforms and odometry, of other streams one message: their frame does not change."""
     tree = FrameTree()
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if facts.readable and facts.count:
-            for message in material.messages(name):
+            for message in data.messages(name):
                 tree.see(name, message)
                 if facts.type != "Transforms":
                     break
     return tree
 
 
-def _kept(material: Material, contract: Contract, timings: dict[str, Timing]) -> Iterator[Finding]:
+def _kept(data: LintInput, contract: Contract, timings: dict[str, Timing]) -> Iterator[Finding]:
     """The terms of the contract that are not kept."""
     for word, terms in contract.streams.items():
-        meant = [name for name in material.streams if means(word, name, material.namespace)]
-        if not any(material.streams[name].count for name in meant):
+        meant = [name for name in data.streams if means(word, name, data.namespace)]
+        if not any(data.streams[name].count for name in meant):
             if not terms.optional:
                 yield Finding("contract", word, "error", "has no message" if meant else "is missing")
             continue
         for name in meant:
-            if contract.terms_of(name, material.namespace) is terms and material.streams[name].count:
-                yield from _kept_by(material, name, terms, timings.get(name))
+            if contract.terms_of(name, data.namespace) is terms and data.streams[name].count:
+                yield from _kept_by(data, name, terms, timings.get(name))
 
 
-def _kept_by(material: Material, stream: str, terms: StreamTerms, timing: Timing | None) -> Iterator[Finding]:
-    found = material.streams[stream].type
+def _kept_by(data: LintInput, stream: str, terms: StreamTerms, timing: Timing | None) -> Iterator[Finding]:
+    found = data.streams[stream].type
     if terms.type is not None and found != terms.type:
         yield Finding("contract", stream, "error", f"is of type {found}; the contract wants {terms.type}")
     if terms.rate is None or timing is None:
@@ -146,27 +145,19 @@ def _kept_by(material: Material, stream: str, terms: StreamTerms, timing: Timing
 
 
 def compare_clocks(
-    material: Material, timings: dict[str, Timing], contract: Contract
+    data: LintInput, timings: dict[str, Timing], contract: Contract
 ) -> tuple[str, dict[str, ClockDifference]]:
     """The reference, and the lateness of each stream that shows turning is against it."""
-    ignored = contract.clocks.ignore
-    names = [
-        name
-        for name, facts in material.streams.items()
-        if facts.type in READERS
-        and facts.readable
-        and name in timings
-        and not any(means(word, name, material.namespace) for word in ignored)
-    ]
     origin = min((timing.first for timing in timings.values()), default=0)
     turnings: dict[str, Turning] = {}
-    for name in names:
-        turning = turning_of(material.messages(name), material.streams[name].type, origin)
-        if turning is not None:
-            turnings[name] = turning
+    for name, facts in data.streams.items():
+        ignored = any(means(word, name, data.namespace) for word in contract.clocks.ignore)
+        if facts.readable and name in timings and not ignored:
+            turning = turning_of(data.messages(name), facts.type, origin)
+            turnings |= {} if turning is None else {name: turning}
     if len(turnings) < 2:
         return "", {}
-    finest = _reference(material, turnings, contract)
+    finest = _reference(data, turnings, contract)
     found = {finest: NONE}
     for name, turning in turnings.items():
         if name != finest and (difference := clock_difference(turning, turnings[finest])) is not None:
@@ -178,13 +169,13 @@ def compare_clocks(
     return finest, found
 
 
-def _reference(material: Material, turnings: dict[str, Turning], contract: Contract) -> str:
+def _reference(data: LintInput, turnings: dict[str, Turning], contract: Contract) -> str:
     """The contract's reference, else the gyroscope with most samples, else the stream with most of them."""
     if (word := contract.clocks.reference) is not None:
-        named = next((name for name in turnings if means(word, name, material.namespace)), None)
+        named = next((name for name in turnings if means(word, name, data.namespace)), None)
         if named is not None:
             return named
-    gyros = [name for name in turnings if material.streams[name].type == "Imu"]
+    gyros = [name for name in turnings if data.streams[name].type == "Imu"]
     return max(gyros or turnings, key=lambda name: len(turnings[name].ends))
 
 

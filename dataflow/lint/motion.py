@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.messages import Imu, Odometry, Pose, Transforms
 
 F64 = npt.NDArray[np.float64]
@@ -70,12 +69,12 @@ class Motion:
         return np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
 
 
-def check_motion(material: Material) -> Iterator[Finding]:
+def check_motion(data: LintInput) -> Iterator[Finding]:
     """Looks at all messages of inertial sensors, odometry and poses."""
     motions = {}
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if facts.readable and facts.count > FEWEST and facts.type in ("Imu", "Odometry", "Pose"):
-            motion = _motion_of(material, name)
+            motion = _motion_of(data, name)
             if motion is not None:
                 motions[name] = motion
     wrong = set()
@@ -84,15 +83,15 @@ def check_motion(material: Material) -> Iterator[Finding]:
             wrong.add(name)
             yield Finding("motion", name, "warning", text)
     sound = {name: motion for name, motion in motions.items() if name not in wrong}
-    yield from _check_pairs(sound, _mounts(material))
+    yield from _check_pairs(sound, _mounts(data))
 
 
-def _motion_of(material: Material, stream: str) -> Motion | None:
+def _motion_of(data: LintInput, stream: str) -> Motion | None:
     """The motion in a stream; None where fewer messages than `FEWEST` have stamps that go forward."""
     rows: list[tuple[object, ...]] = []
     stamps: list[int] = []
     world = body = ""
-    for message in material.messages(stream):
+    for message in data.messages(stream):
         if stamps and message.stamp <= stamps[-1]:
             continue
         if isinstance(message, Imu):
@@ -221,11 +220,11 @@ Mounts = Mapping[str, tuple[str, Rotation]]
 """Static transforms: child frame → its parent, and the rotation that maps the child's coordinates to the parent's."""
 
 
-def _mounts(material: Material) -> Mounts:
+def _mounts(data: LintInput) -> Mounts:
     found: dict[str, tuple[str, Rotation]] = {}
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if facts.readable and facts.static and facts.type == "Transforms":
-            for message in material.messages(name):
+            for message in data.messages(name):
                 assert isinstance(message, Transforms)
                 for parent, child, turn in zip(message.frames, message.child_frames, message.rotations, strict=True):
                     found[child] = parent, Rotation.from_quat(turn)
@@ -260,25 +259,17 @@ def _check_pairs(motions: Mapping[str, Motion], mounts: Mounts) -> Iterator[Find
             if pair is None:
                 continue
             turned, seen, _ = pair
-            sizes = [np.linalg.norm(rows, axis=1)[:, None] for rows in (seen, turned)]
-            mistake = _mistake(
-                {
-                    "": (sizes[0], sizes[1]),
-                    "its angular velocity is in degrees, and rad/s is wanted": (sizes[0], sizes[1] * DEGREES),
-                },
-                TURNED,
-            )
-            if mistake:
-                yield Finding(
-                    "motion", name, "warning", f"its turning contradicts that of {other}; the two agree if {mistake}"
-                )
+            much, by_rate = (np.linalg.norm(rows, axis=1)[:, None] for rows in (seen, turned))
+            in_degrees = "its angular velocity is in degrees, and rad/s is wanted"
+            text = f"its turning contradicts that of {other}; the two agree if "
+            if mistake := _mistake({"": (much, by_rate), in_degrees: (much, by_rate * DEGREES)}, TURNED):
+                yield Finding("motion", name, "warning", text + mistake)
                 break
             connected = _way(gyro.body, mounts)[-1] == _way(body.body, mounts)[-1]
             mistake = _mistake(_mounted(gyro.body, body.body, mounts, *pair), TURNED) if connected else ""
             if mistake and mistake not in named:
                 named.add(mistake)
-                text = f"its turning contradicts that of {other}; the two agree if {mistake}"
-                yield Finding("motion", name, "warning", text)
+                yield Finding("motion", name, "warning", text + mistake)
 
 
 def _pair(gyro: Motion, body: Motion) -> tuple[F64, F64, F64] | None:

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from itertools import islice, pairwise
 
 import dataflow.messages as messages
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 
 _TYPES = {cls.SCHEMA for cls in (
     messages.CameraInfo, messages.CompressedDepth, messages.CompressedImage, messages.CompressedVideo,
@@ -21,12 +20,12 @@ TURNS = 4
 """Changes to another device and back that are no change of a setting."""
 
 
-def check_publishers(material: Material) -> Iterator[Finding]:
+def check_publishers(data: LintInput) -> Iterator[Finding]:
     """Looks at the first messages of every stream of a sensor."""
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if not (facts.readable and facts.count > TURNS and facts.type in _TYPES):
             continue
-        devices = [_device(message) for message in islice(material.messages(name), LOOKED_AT)]
+        devices = [_device(message) for message in islice(data.messages(name), LOOKED_AT)]
         if len(set(devices)) < 2 or sum(a != b for a, b in pairwise(devices)) < TURNS:
             continue
         who = ", ".join(f"{device} ({number})" for device, number in sorted(Counter(devices).items()))

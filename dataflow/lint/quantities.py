@@ -9,8 +9,7 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.lint.timing import Timing
 from dataflow.messages import DepthImage, Image16, Imu, LaserScan, Message, NavSatFix, PointCloud
 from dataflow.messages.depth_units import DepthSpan
@@ -58,19 +57,16 @@ class _Seen:
     looked: int = 0
 
 
-def check_quantities(material: Material, timings: Mapping[str, Timing]) -> Iterator[Finding]:
+def check_quantities(data: LintInput, timings: Mapping[str, Timing]) -> Iterator[Finding]:
     """Looks at some messages of every stream of sensors, and at the stamps of all streams."""
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if not (facts.readable and facts.count):
             continue
-        seen = _Seen()
-        step = max(1, facts.count // LOOKED_AT)
-        for message in islice(material.messages(name), 0, None, step):
+        seen, step = _Seen(), max(1, facts.count // LOOKED_AT)
+        for message in islice(data.messages(name), 0, LOOKED_AT * step, step):
             if not _look(message, seen):
                 break
             seen.looked += 1
-            if seen.looked >= LOOKED_AT:
-                break
         yield from _findings(name, seen)
         yield from _of_layout(name, seen, timings.get(name))
     yield from check_spans(timings)
@@ -119,9 +115,8 @@ def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
         if 0.7 < pull < 1.3:
             yield found(f"gravity is {pull:.2f}: acceleration is in g, and m/s² is wanted (times 9.81)", gravity=pull)
         elif 700 < pull < 1300:
-            yield found(
-                f"gravity is {pull:.0f}: acceleration is in mg, and m/s² is wanted (times 0.00981)", gravity=pull
-            )
+            text = f"gravity is {pull:.0f}: acceleration is in mg, and m/s² is wanted (times 0.00981)"
+            yield found(text, gravity=pull)
         elif pull < 0.3:
             text = f"gravity is {pull:.2f}: it is taken out, or the readings are of another unit than m/s²"
             yield found(text, gravity=pull)
@@ -147,9 +142,9 @@ def _findings(name: str, seen: _Seen) -> Iterator[Finding]:
         yield found(text, depth=span.median)
     if max(seen.sweep, seen.farthest) > LONGEST_SWEEP:
         worst = max(seen.sweep, seen.farthest)
-        fits = next((u for u, s in (("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9)) if worst * s < 1.0), "")
-        text = f"its points were measured up to {worst:.3g} s from the stamp of their cloud"
-        yield found(text + (f"; in {fits} that would be {_small(worst, fits)}" if fits else ""), seconds=worst)
+        units = (("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
+        fits = next((f"; in {u} that would be {worst * s:.3g} s" for u, s in units if worst * s < 1.0), "")
+        yield found(f"its points were measured up to {worst:.3g} s from the stamp of their cloud{fits}", seconds=worst)
     if seen.ranges and seen.unplaced:
         text = f"in {seen.unplaced:,} of {seen.looked:,} scans most ranges are beyond range_max"
         yield found(text + ": are they in millimetres?", scans=seen.unplaced)
@@ -182,10 +177,6 @@ def _of_layout(name: str, seen: _Seen, timing: Timing | None) -> Iterator[Findin
     if seen.swapped and float(np.median(seen.swapped)) < SMOOTHER:
         text = "its pixels are smooth only with their two bytes swapped: is the other order stated (is_bigendian)?"
         yield Finding("quantity", name, "warning", text)
-
-
-def _small(seconds: float, unit: str) -> str:
-    return f"{seconds * {'ms': 1e-3, 'µs': 1e-6, 'ns': 1e-9}[unit]:.3g} s"
 
 
 def check_spans(timings: Mapping[str, Timing]) -> Iterator[Finding]:

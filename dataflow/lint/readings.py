@@ -8,8 +8,7 @@ from itertools import islice
 import numpy as np
 
 from dataflow.interop.conversions import decoded
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Material
+from dataflow.lint.inputs import Finding, LintInput
 from dataflow.messages import CompressedDepth, CompressedImage, MagneticField, Measurement, Message, Odometry, Pose
 from dataflow.recording.errors import RecordingError
 
@@ -35,14 +34,14 @@ _NUMBERS = {
 _ENCODED = ("CompressedImage", "CompressedDepth")
 
 
-def check_readings(material: Material) -> Iterator[Finding]:
+def check_readings(data: LintInput) -> Iterator[Finding]:
     """Looks at some messages of every stream of these types."""
-    for name, facts in material.streams.items():
+    for name, facts in data.streams.items():
         if not (facts.readable and facts.count and facts.type in (*_NUMBERS, *_ENCODED, "Measurement")):
             continue
         most = DECODED if facts.type in _ENCODED else LOOKED_AT
         step = max(1, facts.count // most)
-        looked = list(islice(material.messages(name), 0, most * step, step))
+        looked = list(islice(data.messages(name), 0, most * step, step))
         if looked:
             yield from (
                 Finding("quantity", name, "warning", text, None, values) for text, values in _doubts(facts.type, looked)

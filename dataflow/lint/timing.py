@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Stamps
+from dataflow.lint.inputs import Finding, Stamps
 
 GAP = 2.5
 """Periods without a message that are a gap, in a stream that has a rate."""

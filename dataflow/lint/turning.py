@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from itertools import pairwise
+from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,7 @@ import numpy.typing as npt
 from dataflow.messages import CompressedImage, Image, Imu, Message, Odometry, Pose, WheelTicks
 
 F64 = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 WIDTH: Final = 160
 """Columns to which images are reduced."""
@@ -23,12 +26,11 @@ WIDTH: Final = 160
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """Mean rates over intervals: `begins` and `ends` (s after `origin`, ns), `rates` (≥ 0, of any scale).
+    """Mean rates over intervals: `begins` and `ends` (s after an origin), `rates` (≥ 0, of any scale).
 
     A gyroscope's samples are moments: their intervals reach from one to the next.
     """
 
-    origin: int
     begins: F64
     ends: F64
     rates: F64
@@ -40,22 +42,14 @@ class Turning:
 
 
 def turning_of(messages: Iterable[Message], message_type: str, origin: int) -> Turning | None:
-    """The turning that a stream shows; None where its type shows none or it is too short."""
+    """The turning that a stream shows, from `origin` (ns) on; None where its type shows none or it is too short."""
     read = READERS.get(message_type)
-    if read is None:
+    rows = [] if read is None else [row for row in read(messages) if row[1] > row[0] and np.isfinite(row[2])]
+    if len(rows) < 2:
         return None
-    stamps: list[int] = []
-    rates: list[float] = []
-    begins: list[int] = []
-    for begin, end, rate in read(messages):
-        if end > begin and np.isfinite(rate):
-            begins.append(begin)
-            stamps.append(end)
-            rates.append(rate)
-    if len(rates) < 2:
-        return None
-    seconds = [np.array([stamp - origin for stamp in which], np.float64) * 1e-9 for which in (begins, stamps)]
-    return Turning(origin, seconds[0], seconds[1], np.array(rates))
+    begins, ends, rates = zip(*rows, strict=True)
+    seconds = [np.array([stamp - origin for stamp in which], np.float64) * 1e-9 for which in (begins, ends)]
+    return Turning(seconds[0], seconds[1], np.array(rates))
 
 
 Reading = Iterator[tuple[int, int, float]]
@@ -71,43 +65,43 @@ def _gyro(messages: Iterable[Message]) -> Reading:
         before = message.stamp, rate
 
 
+def _changes(states: Iterable[tuple[int, T]], change: Callable[[T, T], float]) -> Reading:
+    """The mean rate from one (stamp, state) to the next."""
+    for (begin, before), (end, after) in pairwise(states):
+        if end > begin:
+            yield begin, end, change(before, after) / ((end - begin) * 1e-9)
+
+
 def _poses(messages: Iterable[Message]) -> Reading:
-    before: tuple[int, F64] | None = None
-    for message in messages:
-        assert isinstance(message, (Pose, Odometry))
-        if before is not None and message.stamp > before[0]:
-            inner = min(abs(float(message.orientation @ before[1])), 1.0)
-            yield before[0], message.stamp, 2 * np.arccos(inner) / ((message.stamp - before[0]) * 1e-9)
-        before = message.stamp, message.orientation
+    turns = ((m.stamp, m.orientation) for m in messages if isinstance(m, (Pose, Odometry)))
+    return _changes(turns, lambda a, b: float(2 * np.arccos(min(abs(float(b @ a)), 1.0))))
 
 
 def _wheels(messages: Iterable[Message]) -> Reading:
-    before: tuple[int, float] | None = None
-    for message in messages:
-        assert isinstance(message, WheelTicks)
-        sides = [[i for i, name in enumerate(message.names) if side in name.lower()] for side in ("left", "right")]
-        left, right = (which or [k] for which, k in zip(sides, (0, len(message.names) - 1), strict=True))
-        across = float(message.ticks[right].mean() - message.ticks[left].mean())
-        if before is not None and message.stamp > before[0]:
-            yield before[0], message.stamp, abs(across - before[1]) / ((message.stamp - before[0]) * 1e-9)
-        before = message.stamp, across
+    ticks = ((m.stamp, _across(m)) for m in messages if isinstance(m, WheelTicks))
+    return _changes(ticks, lambda a, b: abs(b - a))
+
+
+def _across(message: WheelTicks) -> float:
+    sides = [[i for i, name in enumerate(message.names) if side in name.lower()] for side in ("left", "right")]
+    left, right = (which or [k] for which, k in zip(sides, (0, len(message.names) - 1), strict=True))
+    return float(message.ticks[right].mean() - message.ticks[left].mean())
 
 
 def _images(messages: Iterable[Message]) -> Reading:
     import cv2
 
-    before: tuple[int, npt.NDArray[np.float32]] | None = None
-    window: npt.NDArray[np.float32] | None = None
-    for message in messages:
-        pixels = _grey(message)
-        if pixels is None:
-            continue
-        if window is None or window.shape != pixels.shape:
-            window, before = cv2.createHanningWindow(pixels.shape[::-1], cv2.CV_32F), None  # type: ignore[assignment]
-        if before is not None and message.stamp > before[0]:
-            (x, y), _ = cv2.phaseCorrelate(before[1], pixels, window)
-            yield before[0], message.stamp, float(np.hypot(x, y)) / ((message.stamp - before[0]) * 1e-9)
-        before = message.stamp, pixels
+    @cache
+    def window(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+        return cv2.createHanningWindow(shape[::-1], cv2.CV_32F)  # type: ignore[return-value]
+
+    def moved(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> float:
+        if a.shape != b.shape:
+            return np.nan
+        (x, y), _ = cv2.phaseCorrelate(a, b, window(a.shape))
+        return float(np.hypot(x, y))
+
+    return _changes(((m.stamp, pixels) for m in messages if (pixels := _grey(m)) is not None), moved)
 
 
 def _grey(message: Message) -> npt.NDArray[np.float32] | None:

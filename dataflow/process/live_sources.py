@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dataflow.chaos.faults import SourceFaults
-from dataflow.chaos.kinds import TO_SOURCES
+from dataflow.chaos.faults import TO_SOURCES, SourceFaults
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Handover, Window

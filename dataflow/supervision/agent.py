@@ -62,38 +62,31 @@ class Agent:
     """One machine's agent. `stop()` may be called from a signal handler."""
 
     def __init__(
-        self,
-        name: str,
-        endpoint: str,
-        keys: Path | None,
-        folder: Path,
-        notice: Callable[[str], None],
-        *,
-        patience: float,
+        self, name: str, endpoint: str, keys: Path | None, folder: Path, notice: Callable[[str], None], patience: float
     ) -> None:
-        """`patience`: the seconds for which operators go on without the supervisor being heard."""
-        self.patience = patience
-        self.name, self._endpoint, self._notice = name, endpoint, notice
-        self._keys, self._folder = keys and keys.absolute(), folder.absolute()  # it changes into its folder
+        """`patience`: the seconds for which operators go on without the supervisor being heard. `notice` shows a line
+        to who has started the agent."""
+        self.name, self.patience, self.notice, self._endpoint = name, patience, notice, endpoint
+        self.folder, self._keys = folder.absolute(), keys and keys.absolute()  # it changes into its folder
         self._id = secrets.token_bytes(8)
         self._offered = ""
         self._over: set[str] = set()
-        self._stopped = False
+        self.stopped = False
         self._run = ""
         self._connected, self._since = False, time.monotonic()
         self._said_connected: bool | None = None
 
     def stop(self) -> None:
         """Ends it: a run that it takes part in loses its operators here."""
-        self._stopped = True
+        self.stopped = True
 
     def run(self, *, once: bool = False) -> None:
         """Takes part in runs until it is stopped; `once`: in one. Raises `BusError`, `NetworkError`."""
         more = settings(self._keys, self._endpoint)
         for number, path in enumerate(sys.path):  # processes run in the folder
             sys.path[number] = str(Path(path).absolute())
-        self._folder.mkdir(parents=True, exist_ok=True)
-        os.chdir(self._folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        os.chdir(self.folder)
         with (
             reserve_endpoints(1) as reserved,
             contextlib.closing(router(reserved.endpoints, (self._endpoint,), more)) as bus,
@@ -102,8 +95,8 @@ class Agent:
             taken = bus.session.declare_subscriber(
                 machine_key(self.name, "start"), zenoh.handlers.Callback(self._started, indirect=False)
             )
-            self._notice(f"machine {self.name!r} waits for a run at {self._endpoint}")
-            while not self._stopped:
+            self.notice(f"machine {self.name!r} waits for a run at {self._endpoint}")
+            while not self.stopped:
                 if not self._offered:
                     self._look_at_link(bus)
                     time.sleep(TICK)
@@ -115,7 +108,7 @@ class Agent:
                 self._run = ""
                 if once:
                     break
-            self._stopped = True
+            self.stopped = True
             undeclare(taken)
 
     def _look_at_link(self, bus: Bus) -> None:
@@ -126,15 +119,12 @@ class Agent:
         if connected == self._said_connected or now - self._since < LINK_AFTER:
             return
         self._said_connected = connected
-        if connected:
-            self._notice(
-                f"connected to {self._endpoint}, and offered no run: does its graph name the machine {self.name!r}, "
-                "and are these the keys of that machine?"
-            )
-        else:
-            self._notice(
-                f"not connected to {self._endpoint}: no run is there yet, or its keys are of another authority"
-            )
+        self.notice(
+            f"connected to {self._endpoint}, and offered no run: does its graph name the machine {self.name!r}, "
+            "and are these the keys of that machine?"
+            if connected
+            else f"not connected to {self._endpoint}: no run is there yet, or its keys are of another authority"
+        )
 
     def _started(self, sample: Any) -> None:
         run = msgpack.unpackb(sample.payload.to_bytes(), raw=False)["run"]
@@ -145,7 +135,7 @@ class Agent:
         """Announces this machine until it stops."""
         key = machine_key(self.name, "hello")
         with contextlib.suppress(zenoh.ZError):  # the session was closed
-            while not self._stopped:
+            while not self.stopped:
                 hello = msgpack.packb({"agent": self._id, "run": self._run})
                 bus.session.put(key, hello, congestion_control=zenoh.CongestionControl.DROP, express=True)
                 time.sleep(HELLO_EVERY)
@@ -153,19 +143,7 @@ class Agent:
     @property
     def wanted_elsewhere(self) -> bool:
         """Returns whether it is to end: it was stopped, or another run asks for it."""
-        return self._stopped or bool(self._offered)
-
-    @property
-    def stopped(self) -> bool:
-        return self._stopped
-
-    @property
-    def folder(self) -> Path:
-        return self._folder
-
-    def notice(self, text: str) -> None:
-        """Shows a line to who has started the agent."""
-        self._notice(text)
+        return self.stopped or bool(self._offered)
 
 
 class Stay:

@@ -21,7 +21,7 @@ from dataflow.environments import Environment, environment_of
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
 from dataflow.process.start import start
-from dataflow.supervision.core.wording import how_it_ended
+from dataflow.supervision.core.life import how_it_ended
 from dataflow.supervision.nursery_process import DIE_WITHIN, ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN, adopt_orphans
 
 LEAVE_WITHIN = 15.0

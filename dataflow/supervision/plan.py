@@ -212,8 +212,7 @@ def _machine_of(plan: RunPlan, label: str, nodes: list[str]) -> str | None:
     if len(found) > 1:
         from dataflow.transport import NetworkError
 
-        named = ", ".join(sorted(machine or "this one" for machine in found))
-        raise NetworkError(f"process {label!r} would be on several machines ({named}): place its operators apart")
+        raise NetworkError(_apart(label, "on several machines", found))
     return found.pop()
 
 
@@ -221,9 +220,13 @@ def _env_of(graph: Graph, label: str, nodes: tuple[str, ...]) -> str | None:
     """Returns the environment of a process. Raises `EnvError` where the placement puts operators of two into it."""
     found = {graph.nodes[node].env for node in nodes}
     if len(found) > 1:
-        named = ", ".join(sorted(env or "this one" for env in found))
-        raise EnvError(f"process {label!r} would be in several environments ({named}): place its operators apart")
+        raise EnvError(_apart(label, "in several environments", found))
     return found.pop() if found else None
+
+
+def _apart(label: str, where: str, found: set[str | None]) -> str:
+    named = ", ".join(sorted(each or "this one" for each in found))
+    return f"process {label!r} would be {where} ({named}): place its operators apart"
 
 
 def taken_keys(graph: Graph, process: ProcessPlan) -> set[str]:

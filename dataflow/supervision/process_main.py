@@ -43,13 +43,7 @@ def _listen(channel: Channel, inbox: Inbox) -> None:
         os._exit(SUPERVISOR_GONE)
 
 
-def _make(
-    kind: str,
-    config: dict[str, Any],
-    channel: Channel,
-    inbox: Inbox,
-    handed: Descriptors,
-) -> Any:
+def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: Inbox, handed: Descriptors) -> Any:
     """Makes the process that the supervisor asks for: "operators" runs operators, "sink" takes whole streams."""
     if kind == "sink":
         from dataflow.sinks.live_sink import LiveSinkProcess

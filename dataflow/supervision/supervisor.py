@@ -48,11 +48,7 @@ class Supervisor:
     """Runs one plan. `stop()` may be called from a signal handler; `status` may be read at any time."""
 
     def __init__(
-        self,
-        plan: RunPlan,
-        *,
-        on_output: Callable[[str, str], None] | None = None,
-        early: EarlyNursery | None = None,
+        self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None, early: EarlyNursery | None = None
     ) -> None:
         self.plan = plan
         self._early = early

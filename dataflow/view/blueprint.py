@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.api import VisualizerLike
 
-from dataflow.graph.model import Graph
 from dataflow.graph.sections import PANELS
-from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
+from dataflow.messages import Diagnostics, NavSatFix, Odometry, PointCloud, Pose
 from dataflow.view.canvas import Role
 from dataflow.view.drawing import plots_of, roles_of
-from dataflow.view.layout import Camera, Layout, layout
+from dataflow.view.layout import Camera, Layout
 from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, entity_of
 from dataflow.view.scores import SCORES
 from dataflow.view.viewpoint import Outlook
@@ -24,27 +23,23 @@ _BACKGROUND = (24, 27, 33)
 _PLOT_SECONDS = 10.0
 _WIDE, _HIGH = (-0.08 * WIDTH, 0.92 * WIDTH), (-0.03 * HEIGHT, 1.03 * HEIGHT)
 
+_WHOLE = rrb.VisibleTimeRanges(
+    [rr.VisibleTimeRange(TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())]
+)
+"""All that was drawn up to the cursor stays in view."""
+
+Overrides = dict[rr.encodings.EntityPath | str, VisualizerLike]
 Part = rrb.View | rrb.Container
 
 
 def blueprint(
-    streams: Mapping[str, type[Message]],
-    graph: Graph | None = None,
-    *,
-    outlook: Outlook | None = None,
-    following: bool = False,
-) -> rrb.Blueprint:
-    """The views for `streams` (name → message type), less those that the graph hides.
-
-    `outlook` is the view point; without it Rerun chooses. `following`: the viewer keeps up with what arrives.
-    """
-    return blueprint_of(layout(streams, graph), outlook=outlook, following=following)
-
-
-def blueprint_of(
     shown: Layout, *, outlook: Outlook | None = None, following: bool = False, scores: bool = False
 ) -> rrb.Blueprint:
-    """The views for a layout; `scores`: a run's scores are there."""
+    """The views for a layout.
+
+    `outlook` is the view point; without it Rerun chooses. `following`: the viewer keeps up with what arrives. `scores`:
+    a run's scores are there.
+    """
     chosen = shown.panels or PANELS
     world = _world(shown, outlook) if "world" in chosen else None
     cameras = [_camera(camera, shown) for camera in shown.cameras] if "cameras" in chosen else []
@@ -83,9 +78,8 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
     None where nothing has depth or a place: colour images alone would hang in an empty world.
     """
     clouds = shown.of_type(PointCloud)
-    contents = []
     placed = [name for name in _with_role(shown, "space") if (name, "space") not in shown.empty]
-    contents += [f"+ {entity_of(name)}/space/**" for name in placed]
+    contents = [f"+ {entity_of(name)}/space/**" for name in placed]
     for name in _with_role(shown, "image"):
         users = [c for c in shown.cameras if name in (c.image, c.info)]
         calibrated = [c for c in users if c.info is not None]
@@ -93,16 +87,9 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
             contents.append(f"+ {entity_of(name)}")
     if not placed and not any(c.depth and c.info is not None for c in shown.cameras):
         return None
-    forever = rr.VisibleTimeRange(
-        TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
-    )
-    trails: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
-        f"{entity_of(name)}/space/trail": rrb.VisibleTimeRanges([forever]) for name in shown.of_type(Pose, Odometry)
-    }
-    trails |= {f"{entity_of(name)}/space/kept": rrb.VisibleTimeRanges([forever]) for name in shown.kept}
-    hidden: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
-        f"{entity_of(name)}/space": rrb.EntityBehavior(visible=False) for name in shown.aside
-    }
+    overrides: Overrides = {f"{entity_of(name)}/space/trail": _WHOLE for name in shown.of_type(Pose, Odometry)}
+    overrides |= {f"{entity_of(name)}/space/kept": _WHOLE for name in shown.kept}
+    overrides |= {f"{entity_of(name)}/space": rrb.EntityBehavior(visible=False) for name in shown.aside}
     eye = None
     if outlook is not None and outlook.position is not None:
         eye = rrb.EyeControls3D(position=outlook.position, look_target=outlook.target, eye_up=outlook.up)
@@ -112,7 +99,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
         name="World",
         background=_BACKGROUND,
         eye_controls=eye,
-        overrides={**trails, **hidden},
+        overrides=overrides,
     )
 
 
@@ -128,16 +115,17 @@ def _camera(camera: Camera, shown: Layout) -> rrb.Spatial2DView:
 
 
 def _graphs(shown: Layout) -> list[Part]:
+    kinds = rrb.archetypes
     return [
         rrb.GraphView(
             origin=f"{entity_of(name)}/graph",
             name=_titled("Scene graph", name, shown),
             visual_bounds=rrb.VisualBounds2D(x_range=_WIDE, y_range=_HIGH),
-            force_link=rrb.archetypes.ForceLink(enabled=False),
-            force_many_body=rrb.archetypes.ForceManyBody(enabled=False),
-            force_position=rrb.archetypes.ForcePosition(enabled=False),
-            force_collision_radius=rrb.archetypes.ForceCollisionRadius(enabled=False),
-            force_center=rrb.archetypes.ForceCenter(enabled=False),
+            force_link=kinds.ForceLink(enabled=False),
+            force_many_body=kinds.ForceManyBody(enabled=False),
+            force_position=kinds.ForcePosition(enabled=False),
+            force_collision_radius=kinds.ForceCollisionRadius(enabled=False),
+            force_center=kinds.ForceCenter(enabled=False),
         )
         for name in sorted(_with_role(shown, "graph"), key=lambda name: name in shown.aside)
     ]
@@ -154,21 +142,9 @@ def _texts(shown: Layout) -> list[Part]:
 
 def _maps(shown: Layout) -> list[Part]:
     names = _with_role(shown, "map")
-    if not names:
-        return []
-    forever = rr.VisibleTimeRange(
-        TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
-    )
-    return [
-        rrb.MapView(
-            origin="/",
-            contents=[f"+ {entity_of(name)}/map/**" for name in names],
-            name="Map",
-            overrides={
-                f"{entity_of(name)}/map/way": rrb.VisibleTimeRanges([forever]) for name in shown.of_type(NavSatFix)
-            },
-        )
-    ]
+    ways: Overrides = {f"{entity_of(name)}/map/way": _WHOLE for name in shown.of_type(NavSatFix)}
+    contents = [f"+ {entity_of(name)}/map/**" for name in names]
+    return [rrb.MapView(origin="/", contents=contents, name="Map", overrides=ways)] if names else []
 
 
 def _tensors(shown: Layout) -> list[Part]:
@@ -200,19 +176,13 @@ def _plots(shown: Layout) -> list[Part]:
 
 def _status(shown: Layout) -> Part | None:
     """A lane for everything that reports its health: green, yellow, red, grey where it is silent."""
-    names = _with_role(shown, "status")
-    if not names:
-        return None
-    contents = [f"+ {entity_of(name)}/status/**" for name in names]
-    return rrb.StateTimelineView(origin="/", contents=contents, name="Status")
+    contents = [f"+ {entity_of(name)}/status/**" for name in _with_role(shown, "status")]
+    return rrb.StateTimelineView(origin="/", contents=contents, name="Status") if contents else None
 
 
 def _plot(name: str, contents: Sequence[str]) -> rrb.TimeSeriesView:
-    window = rr.VisibleTimeRange(
-        TIMELINE,
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SECONDS),
-        end=rr.TimeRangeBoundary.cursor_relative(),
-    )
+    near = rr.TimeRangeBoundary.cursor_relative
+    window = rr.VisibleTimeRange(TIMELINE, start=near(seconds=-_PLOT_SECONDS), end=near())
     return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, time_ranges=[window])
 
 

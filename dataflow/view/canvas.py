@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,7 +14,8 @@ import rerun as rr
 from dataflow.messages import Message, Odometry, Pose, Transforms
 from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
-from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
+from dataflow.view.layout import is_truth
+from dataflow.view.scene import TIMELINE, VIEWER_LOG, Placed, SceneState
 
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
@@ -113,20 +113,11 @@ class Canvas:
 
         What cannot be (a frame within itself) is not drawn, and said once.
         """
-        if self.stream in self.scene.layout.placing:
-            place = partial(self.scene.offer, tree=tree)
-        else:
-            place = partial(self.scene.place, rank=Rank.TREE if tree else self.scene.rank(self.stream))
+        rank = Rank.TREE if tree else Rank.TRUTH if is_truth(self.stream) else Rank.ESTIMATE
+        frames = parent or NAMELESS, child or NAMELESS
         try:
-            place(
-                self.recording,
-                parent=parent or NAMELESS,
-                child=child or NAMELESS,
-                T_parent_child=T_parent_child,
-                stream=self.stream,
-                stamp=self.stamp,
-                static=self.static,
-            )
+            pose = Placed(*frames, T_parent_child, self.stream, rank, self.stamp, self.static)
+            self.scene.place(self.recording, pose)
         except FrameCycleError as error:
             self.notice(str(error))
 

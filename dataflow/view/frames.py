@@ -217,8 +217,7 @@ class FrameTree:
         if top_a == top_b:
             return changes
         _, T_a, T_b = min(
-            ((abs(sa - sb), Ta, Tb) for sa, Ta in a.poses for sb, Tb in b.poses),
-            key=lambda candidate: candidate[0],
+            ((abs(sa - sb), Ta, Tb) for sa, Ta in a.poses for sb, Tb in b.poses), key=lambda candidate: candidate[0]
         )
         T_a_b = T_topa_a @ T_a @ invert(T_topb_b @ T_b)
         if _preference(top_a) <= _preference(top_b):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from types import MappingProxyType
 
 from dataflow.graph.model import Graph
-from dataflow.graph.sections import PLACE_FRAMES
+from dataflow.graph.sections import PLACE_FRAMES, View
 from dataflow.messages import (
     Boxes3D,
     CameraInfo,
@@ -103,15 +104,13 @@ def layout(
     With a graph, what is drawn over an image is found by walking the graph upstream; without one, by the words that
     names share. `static` and `hidden` add to those of the graph.
     """
-    hidden = {*hidden, *(graph.view.hide if graph is not None else ())}
+    view = View() if graph is None else graph.view
+    hidden = {*hidden, *view.hide}
     placing = frozenset(name for name, type_ in streams.items() if name in hidden and type_.SCHEMA in PLACE_FRAMES)
     shown = {name: streams[name] for name in sorted(streams) if name not in hidden}
     copies = _decoded(shown, graph) if graph is not None else {}
     shown = {name: type_ for name, type_ in shown.items() if name not in copies}
-    fixed = set(static)
-    if graph is not None:
-        fixed |= {name for name, stream in graph.streams.items() if stream.static}
-    fixed &= shown.keys() | placing
+    fixed = {*static, *(graph.static if graph is not None else ())} & (shown.keys() | placing)
 
     images = [name for name, type_ in shown.items() if issubclass(type_, COLOR)]
     depths = [name for name, type_ in shown.items() if issubclass(type_, DEPTH)]
@@ -119,9 +118,8 @@ def layout(
     info_of = {name: _calibration(name, infos, images + depths, graph) for name in images + depths}
 
     over: dict[str, list[str]] = {name: [] for name in images + depths}
-    planes: dict[str, str] = {info: plane_name(info) for info in infos}
-    for name, info in info_of.items():
-        planes[name] = plane_name(info or name)
+    planes = {info: plane_name(info) for info in infos}
+    planes |= {name: plane_name(info or name) for name, info in info_of.items()}
     for name, type_ in shown.items():
         if issubclass(type_, OVERLAYS) and (image := _image_under(name, images, depths, graph, copies)) is not None:
             over[image].append(name)
@@ -129,11 +127,15 @@ def layout(
     cameras = tuple(
         Camera(name, info_of[name], depth=name in depths, overlays=tuple(over[name])) for name in images + depths
     )
-    panels = graph.view.panels if graph is not None else ()
-    aside = _aside(shown, graph)
-    kept = frozenset(graph.view.keep if graph is not None else ())
     return Layout(
-        MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels, kept, placing
+        streams=MappingProxyType(shown),
+        cameras=cameras,
+        planes=MappingProxyType(planes),
+        static=frozenset(fixed),
+        aside=_aside(shown, graph),
+        panels=view.panels,
+        kept=frozenset(view.keep),
+        placing=placing,
     )
 
 
@@ -153,7 +155,8 @@ def _calibration(image: str, infos: list[str], images: list[str], graph: Graph |
     What an operator makes of no image, such as a plot, is no camera's and has none."""
     if graph is not None and _drawn(image, graph):
         return None
-    near = [info for info in infos if _operator(info) == _operator(image)]
+    operator, _, port = image.rpartition("/")
+    near = [info for info in infos if info.rpartition("/")[0] == operator]
     if not near and graph is not None:
         for stream in _upstream(image, graph):
             if stream in images:
@@ -161,20 +164,20 @@ def _calibration(image: str, infos: list[str], images: list[str], graph: Graph |
             if stream in infos:
                 return stream
     if not near:
-        shared = {info: len(_common(_operator(info), _operator(image))) for info in infos}
+        shared = {info: _common(info.split("/")[:-1], image.split("/")[:-1]) for info in infos}
         near = [info for info in infos if shared[info] == max(shared.values()) and shared[info] > 0]
         if not near and len(infos) == 1:
             near = infos
-    return max(near, key=lambda info: (_likeness(_port(info), _port(image)), -len(info)), default=None)
+    return max(near, key=lambda info: (_likeness(info.rpartition("/")[2], port), -len(info)), default=None)
 
 
 def _drawn(image: str, graph: Graph) -> bool:
     """Returns whether an operator makes an image of messages none of which is an image."""
     if image not in graph.streams:
         return False
-    taken = [stream for streams in graph.producer(image)[0].inputs.values() for stream in streams]
-    made = {name for stream in taken if stream in graph.streams for name in graph.streams[stream].types}
-    return bool(taken) and all(stream in graph.streams for stream in taken) and not made & _PICTURES
+    taken = graph.producer(image)[0].taken
+    made = {name for stream in taken & graph.streams.keys() for name in graph.streams[stream].types}
+    return bool(taken) and taken <= graph.streams.keys() and not made & _PICTURES
 
 
 def _decoded(shown: Mapping[str, type[Message]], graph: Graph) -> dict[str, str]:
@@ -232,30 +235,15 @@ def _upstream(stream: str, graph: Graph) -> Iterable[str]:
                         queue.append(name)
 
 
-def _operator(stream: str) -> str:
-    return stream.rpartition("/")[0]
-
-
-def _port(stream: str) -> str:
-    return stream.rpartition("/")[2]
-
-
 def _words(name: str) -> list[str]:
     return [word for word in re.split(r"[^0-9a-z]+", name.lower()) if word]
 
 
-def _common(a: str, b: str) -> list[str]:
-    """The leading chunks that two keys share."""
-    shared = []
-    for x, y in zip(a.split("/"), b.split("/"), strict=False):
-        if x != y:
-            break
-        shared.append(x)
-    return shared
+def _common(a: Sequence[str], b: Sequence[str]) -> int:
+    """Returns how many leading elements two sequences share."""
+    return len([*takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False))])
 
 
 def _likeness(a: str, b: str) -> tuple[int, int]:
     """Returns how much two names share: words, then leading letters."""
-    words_a, words_b = set(_words(a)), set(_words(b))
-    prefix = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
-    return len(words_a & words_b), prefix
+    return len(set(_words(a)) & set(_words(b))), _common(a, b)

@@ -54,18 +54,10 @@ def from_recording(
     sink stays open. Raises `ViewerError` for a viewer that cannot be reached or takes nothing for 30 s,
     `RecordingError` for an unknown stream and for data that does not decode.
     """
-    readable = {name: info for name, info in recording.streams.items() if info.message_type is not None}
-    types: dict[str, type[Message]] = {
-        name: info.message_type
-        for name, info in readable.items()
-        if info.message_type is not None and (streams is None or name in streams)
-    }
-    others = {
-        name: info.message_type
-        for name, info in readable.items()
-        if info.message_type is not None and name not in types and info.message_type.SCHEMA in PLACE_FRAMES
-    }
-    static = [name for name in (*types, *others) if readable[name].static]
+    readable = {name: info.message_type for name, info in recording.streams.items() if info.message_type is not None}
+    types = {name: type_ for name, type_ in readable.items() if streams is None or name in streams}
+    others = {n: type_ for n, type_ in readable.items() if n not in types and type_.SCHEMA in PLACE_FRAMES}
+    static = [name for name in (*types, *others) if recording.streams[name].static]
     lines: Sequence[tuple[int, LogLine]] = ()
     logs = ""
     if isinstance(recording, Recording) and types.keys() >= readable.keys():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,11 @@ ASSUMPTION_GRACE = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
-    """The place of a frame by a stream that is not shown: `T_parent_child` (4×4) in `parent`."""
+class Placed:
+    """The place of a frame by a stream's message: `T_parent_child` (4×4) in `parent`."""
 
     parent: str
+    child: str
     T_parent_child: Matrix
     stream: str
     rank: Rank
@@ -48,15 +49,15 @@ class Unshown:
     what is shown with it, nor bring its frames into the picture or win one from a stream that is shown.
     """
 
-    _offers: dict[str, Offer] = field(default_factory=dict)
+    _offers: dict[str, Placed] = field(default_factory=dict)
     _wanted: dict[str, int] = field(default_factory=dict)
 
-    def offer(self, child: str, offer: Offer) -> None:
-        held = self._offers.get(child)
-        if held is None or held.stream == offer.stream or offer.rank < held.rank:
-            self._offers[child] = offer
+    def offer(self, pose: Placed) -> None:
+        held = self._offers.get(pose.child)
+        if held is None or held.stream == pose.stream or pose.rank < held.rank:
+            self._offers[pose.child] = pose
 
-    def needed(self, tree: FrameTree, child: str, stamp: int) -> Offer | None:
+    def needed(self, tree: FrameTree, child: str, stamp: int) -> Placed | None:
         """Returns the offer that is to place `child` now, if any.
 
         What moves is taken a message later than it is first wanted: what is shown and of the same stamp may place it.
@@ -64,11 +65,8 @@ class Unshown:
         offer = self._offers.get(child)
         if offer is None or child not in tree:
             return None
-        owner = tree.owner(child)
-        if owner == offer.stream:
-            return offer
-        if owner is not None:
-            return None
+        if (owner := tree.owner(child)) is not None:
+            return offer if owner == offer.stream else None
         return offer if offer.static or self._wanted.setdefault(child, stamp) < stamp else None
 
 
@@ -106,22 +104,18 @@ class ViewOptions:
     track_history: int = 5_000_000_000
 
     def __post_init__(self) -> None:
-        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality must be 1 to 100 or None, got {self.jpeg_quality}")
-        if self.depth_step is not None and not self.depth_step > 0:
-            raise ValueError(f"depth_step must be more than 0 m or None, got {self.depth_step}")
-        if self.depth_block < 1:
-            raise ValueError(f"depth_block must be at least 1 pixel, got {self.depth_block}")
-        if not self.point_step >= 0:
-            raise ValueError(f"point_step must be 0 m or more, got {self.point_step}")
-        if not self.kept_step > 0:
-            raise ValueError(f"kept_step must be more than 0 m, got {self.kept_step}")
-        if self.image_step < 0:
-            raise ValueError(f"image_step must be 0 ns or more, got {self.image_step}")
-        if self.point_shades < 0 or self.point_shades == 1:
-            raise ValueError(f"point_shades must be at least 2, or 0 for all, got {self.point_shades}")
-        if self.max_points < 1:
-            raise ValueError(f"max_points must be at least 1, got {self.max_points}")
+        for name, fits, wanted in (
+            ("jpeg_quality", self.jpeg_quality is None or 1 <= self.jpeg_quality <= 100, "1 to 100 or None"),
+            ("depth_step", self.depth_step is None or self.depth_step > 0, "more than 0 m or None"),
+            ("depth_block", self.depth_block >= 1, "at least 1 pixel"),
+            ("point_step", self.point_step >= 0, "0 m or more"),
+            ("kept_step", self.kept_step > 0, "more than 0 m"),
+            ("image_step", self.image_step >= 0, "0 ns or more"),
+            ("point_shades", self.point_shades == 0 or self.point_shades >= 2, "at least 2, or 0 for all"),
+            ("max_points", self.max_points >= 1, "at least 1"),
+        ):
+            if not fits:
+                raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)}")
 
 
 @dataclass(slots=True)
@@ -180,10 +174,6 @@ class SceneState:
         self._noted.add((stream, what))
         return True
 
-    def rank(self, stream: str) -> Rank:
-        """Whose word counts on where frames lie."""
-        return Rank.TRUTH if is_truth(stream) else Rank.ESTIMATE
-
     def trail_color(self, stream: str, streams: tuple[str, ...]) -> colors.RGB:
         """Returns green for ground truth, otherwise a palette colour by the place of the stream among `streams`."""
         if is_truth(stream):
@@ -198,57 +188,28 @@ class SceneState:
             self.draw_frames(recording, self.tree.see(frame), stamp)
             self._take_unshown(recording, frame, stamp)
 
-    def place(
-        self,
-        recording: rr.RecordingStream,
-        *,
-        parent: str,
-        child: str,
-        T_parent_child: Vector,
-        stream: str,
-        rank: Rank,
-        stamp: int,
-        static: bool,
-    ) -> None:
-        """A message places `child` in `parent`; poses that are not finite are passed over."""
-        if not np.isfinite(T_parent_child).all():
+    def place(self, recording: rr.RecordingStream, pose: Placed) -> None:
+        """A message places a frame, or offers to, where its stream is not shown; what is not finite is passed over."""
+        if not np.isfinite(pose.T_parent_child).all():
             return
-        self.viewpoint.posed.setdefault(child)
-        changes = self.tree.place(parent, child, T_parent_child, owner=stream, rank=rank, stamp=stamp)
-        self.draw_frames(recording, changes, stamp, static=static)
-        self._take_unshown(recording, parent, stamp)
+        if pose.stream in self.layout.placing:
+            self.unshown.offer(pose)
+            self._take_unshown(recording, pose.child, pose.stamp)
+        else:
+            self._place(recording, pose)
 
-    def offer(
-        self,
-        recording: rr.RecordingStream,
-        *,
-        parent: str,
-        child: str,
-        T_parent_child: Vector,
-        stream: str,
-        tree: bool,
-        stamp: int,
-        static: bool,
-    ) -> None:
-        """A message of a stream that is not shown places `child` in `parent`, if that is needed."""
-        if np.isfinite(T_parent_child).all():
-            rank = Rank.TREE if tree else self.rank(stream)
-            self.unshown.offer(child, Offer(parent, T_parent_child, stream, rank, stamp, static))
-            self._take_unshown(recording, child, stamp)
+    def _place(self, recording: rr.RecordingStream, pose: Placed) -> None:
+        parent, child, T_parent_child = pose.parent, pose.child, pose.T_parent_child
+        self.viewpoint.posed.setdefault(child)
+        changes = self.tree.place(parent, child, T_parent_child, owner=pose.stream, rank=pose.rank, stamp=pose.stamp)
+        self.draw_frames(recording, changes, pose.stamp, static=pose.static)
+        self._take_unshown(recording, parent, pose.stamp)
 
     def _take_unshown(self, recording: rr.RecordingStream, child: str, stamp: int) -> None:
         offer = self.unshown.needed(self.tree, child, stamp)
         if offer is not None and (offer.stamp == stamp or self.tree.owner(child) is None):
-            self.place(
-                recording,
-                parent=offer.parent,
-                child=child,
-                T_parent_child=offer.T_parent_child,
-                stream=offer.stream,
-                rank=Rank.TREE if offer.rank is Rank.TREE else Rank.UNSHOWN,
-                stamp=stamp,
-                static=offer.static,
-            )
+            rank = Rank.TREE if offer.rank is Rank.TREE else Rank.UNSHOWN
+            self._place(recording, replace(offer, rank=rank, stamp=stamp))
 
     def draw_frames(
         self, recording: rr.RecordingStream, changes: list[Change], stamp: int, *, static: bool = False
@@ -268,21 +229,13 @@ class SceneState:
                     if change.assumed:
                         self._waiting.setdefault(change.child, stamp)
                 case Detach():
-                    self._log_frame(
-                        recording, change.child, rr.Clear(recursive=False), stamp, static=static, given=False
-                    )
+                    cleared = rr.Clear(recursive=False)
+                    self._log_frame(recording, change.child, cleared, stamp, static=static, given=False)
                 case NewRoot():
                     recording.log(SCENE, rr.CoordinateFrame(change.frame), static=True)
 
     def _log_frame(
-        self,
-        recording: rr.RecordingStream,
-        frame: str,
-        row: rr.AsComponents,
-        stamp: int,
-        *,
-        static: bool,
-        given: bool,
+        self, recording: rr.RecordingStream, frame: str, row: rr.AsComponents, stamp: int, *, static: bool, given: bool
     ) -> None:
         """Logs a row of a frame so that it takes the place of what was assumed, whichever of the two is stamped later.
 
@@ -309,11 +262,8 @@ class SceneState:
             elif stamp - since >= ASSUMPTION_GRACE:
                 del self._waiting[frame]
                 reason = self.tree.reason(frame)
-                words.append(
-                    f"frame {frame!r} is not placed by any stream: drawn so that {reason} agree at first"
-                    if reason
-                    else f"frame {frame!r} is not placed by any stream: drawn at the origin of {assumed[frame]!r}"
-                )
+                where = f"so that {reason} agree at first" if reason else f"at the origin of {assumed[frame]!r}"
+                words.append(f"frame {frame!r} is not placed by any stream: drawn {where}")
         return words
 
 

@@ -25,7 +25,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Message
 from dataflow.view import process
 from dataflow.view.backlog import Backlog, Bounds
-from dataflow.view.blueprint import blueprint_of
+from dataflow.view.blueprint import blueprint
 from dataflow.view.drawing import parts_of, visualize
 from dataflow.view.layout import layout
 from dataflow.view.pacing import Pace
@@ -129,7 +129,7 @@ class ViewerSink:
         recording.log(SCENE, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._saved_layout(recording, graph)
         if not isinstance(self.target, Save) and not self._laid_out:
-            recording.send_blueprint(blueprint_of(self._scene.layout, following=True))
+            recording.send_blueprint(blueprint(self._scene.layout, following=True))
         self._recording = recording
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
@@ -274,10 +274,9 @@ class ViewerSink:
 
     def _look_again(self, recording: rr.RecordingStream) -> None:
         """Chooses the viewpoint once more, from which all that there is in a file is in view."""
-        if not self._scene.viewpoint.knows_more:
-            return
-        self._outlook = self._scene.viewpoint.outlook(self._scene.tree, whole=True)
-        self._lay_out(recording)
+        if self._scene.viewpoint.knows_more:
+            self._outlook = self._scene.viewpoint.outlook(self._scene.tree, whole=True)
+            self._lay_out(recording)
 
     def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:
         """Takes the layout that the graph names, as saved from the viewer, in place of a derived one."""
@@ -300,8 +299,8 @@ class ViewerSink:
         parts = [(name, part) for name, type_ in shown.streams.items() for part in parts_of(type_)]
         shown = replace(shown, empty=frozenset(each for each in parts if not self._scene.has_drawn(*each)))
         following = not isinstance(self.target, Save) or self.target.at_end
-        blueprint = blueprint_of(shown, outlook=self._outlook, following=following, scores=bool(self._scores))
-        recording.send_blueprint(blueprint)
+        views = blueprint(shown, outlook=self._outlook, following=following, scores=bool(self._scores))
+        recording.send_blueprint(views)
 
     def _guarded(self, stream: str, action: Callable[[], object]) -> bool:
         """Runs an action whose failure must not end the viewer; returns whether it worked."""

@@ -102,7 +102,7 @@ def test_the_newest_message_of_a_batch_is_the_cause_and_long_runs_come_in_parts(
     assert [each["value"]["intValue"] for each in cause["attributes"]][:2] == ["7", "7"]
 
 
-def test_spans_of_a_running_graph_wait_for_causes_that_are_told_later() -> None:
+def test_spans_of_a_running_graph_wait_for_causes_that_arrive_later() -> None:
     graph = load_text(DIAMOND)
     rounds = [one_round(graph, k, 100.0 + 20 * k, slow=10) for k in range(4)]
     whole = spans_of(DIAMOND, {name: [r for each in rounds for r in each[name]] for name in rounds[0]})

@@ -47,7 +47,7 @@ def test_matching_is_by_definition_of_the_wildcards(pattern: str, keys: list[str
 
 @settings(max_examples=800, deadline=None)
 @given(ANY_PATTERNS, ANY_PATTERNS)
-def test_two_expressions_meet_and_are_spelled_as_zenoh_says(one: str, other: str) -> None:
+def test_intersection_and_canonical_form_are_those_of_zenoh(one: str, other: str) -> None:
     theirs = [zenoh.KeyExpr.autocanonize(key) for key in (one, other)]
     assert [canonical(one), canonical(other)] == [str(key) for key in theirs]
     assert intersect(canonical(one), canonical(other)) == theirs[0].intersects(theirs[1])

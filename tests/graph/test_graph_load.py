@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import asdict
@@ -70,8 +71,11 @@ operators:
 """
 
 
-def node_inputs(graph: Graph, name: str) -> dict[str, tuple[str, ...]]:
-    return dict(graph.nodes[name].inputs)
+def nested(folder: Path, front: str = FRONT) -> Path:
+    (folder / "parts").mkdir()
+    (folder / "parts" / "front.yaml").write_text(front)
+    (folder / "outer.yaml").write_text(OUTER)
+    return folder / "outer.yaml"
 
 
 def test_a_file_resolves_to_streams_parameters_and_policies(tmp_path: Path) -> None:
@@ -80,12 +84,12 @@ def test_a_file_resolves_to_streams_parameters_and_policies(tmp_path: Path) -> N
     assert (graph.name, graph.namespace, graph.seed, graph.threads) == ("rgbd", "robot1", 7, 2)
     assert graph.nodes["camera"].params == {"rate": 15.0, "path": "/data/rgbd_7scenes"}
     assert graph.nodes["cloud"].params["stride"] == 4
-    assert node_inputs(graph, "cloud") == {
+    assert graph.nodes["cloud"].inputs == {
         "depth": ("robot1/camera/depth",),
         "image": ("robot1/camera/image",),
         "camera": ("robot1/camera/info",),
     }
-    assert node_inputs(graph, "detector") == {"image": ("robot1/camera/image",)}
+    assert graph.nodes["detector"].inputs == {"image": ("robot1/camera/image",)}
     assert graph.nodes["detector"].params["model"] == "nothing.onnx"
     live = graph.nodes["detector"].live
     assert (live.queue, live.size, live.deadline, live.memory) == ("newest", 1, 100_000_000, 3 * 2**29)
@@ -201,12 +205,9 @@ def test_settings_override_operators_and_the_graph() -> None:
 
 
 def test_nested_graph_takes_inputs_and_parameters_and_exports_outputs(tmp_path: Path) -> None:
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "front.yaml").write_text(FRONT)
-    (tmp_path / "outer.yaml").write_text(OUTER)
-    graph = load_graph(tmp_path / "outer.yaml", settings=["front.stride=6", "front/camera.path=x"])
+    graph = load_graph(nested(tmp_path), settings=["front.stride=6", "front/camera.path=x"])
     assert list(graph.nodes) == ["eye", "front/camera", "front/cloud", "odometry"]
-    assert node_inputs(graph, "front/cloud") == {
+    assert graph.nodes["front/cloud"].inputs == {
         "depth": ("outer/front/camera/depth",),
         "image": ("outer/eye/image",),
         "camera": ("outer/front/camera/info",),
@@ -243,20 +244,11 @@ operators:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (
-            ("picture: eye/image", "picture: eye/depth"),
-            "6:23: graph input 'front/picture' takes TestPicture, but",
-        ),
+        (("picture: eye/image", "picture: eye/depth"), "6:23: graph input 'front/picture' takes TestPicture, but"),
         (("picture: eye/image", "pictur: eye/image"), "outer.yaml:6:14: parts/front.yaml has no input 'pictur'"),
-        (
-            ("inputs: {picture: eye/image}", "machine: m"),
-            "5:10: front: input 'picture' (TestPicture) of parts",
-        ),
+        (("inputs: {picture: eye/image}", "machine: m"), "5:10: front: input 'picture' (TestPicture) of parts"),
         (("rate: 5", "rte: 5"), "outer.yaml:7:19: front (parts/front.yaml) has no parameter 'rte'"),
-        (
-            ("rate: 5", "rate: -5"),
-            "parts/front.yaml:6:58: front/camera: parameter 'rate': input should",
-        ),
+        (("rate: 5", "rate: -5"), "parts/front.yaml:6:58: front/camera: parameter 'rate': input should"),
         (("map: front/cloud", "map: front/clod"), "9:79: odometry.map: 'front/clod' is no stream of this graph"),
     ],
 )
@@ -276,15 +268,12 @@ def test_graphs_that_nest_each_other_are_refused() -> None:
 def test_bundle_loads_the_same_graph_without_files_and_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "front.yaml").write_text(FRONT.replace("stride: 2", "stride: '${env:GRAPH_TEST_STRIDE}'"))
-    (tmp_path / "outer.yaml").write_text(OUTER)
+    file = nested(tmp_path, FRONT.replace("stride: 2", "stride: '${env:GRAPH_TEST_STRIDE}'"))
     monkeypatch.setenv("GRAPH_TEST_STRIDE", "9")
-    graph = load_graph(tmp_path / "outer.yaml", settings=["front/camera.path=x"])
+    graph = load_graph(file, settings=["front/camera.path=x"])
     bundle = graph.bundle()
     monkeypatch.delenv("GRAPH_TEST_STRIDE")
-    (tmp_path / "outer.yaml").unlink()
-    (tmp_path / "parts" / "front.yaml").unlink()
+    shutil.rmtree(tmp_path)
     again = load_bundle(bundle)
     assert again == graph
     assert again.nodes["front/cloud"].params["stride"] == 9
@@ -421,9 +410,8 @@ operators:
 
 def test_network_is_loopback_unless_the_graph_says_more() -> None:
     head = 'graph: g\noperators:\n  camera: {use: "graph_operators:Camera"}\n'
-    network = load_text(
-        head + "network: {listen: [tcp/0.0.0.0:7447], connect: tls/base.local:7447, shared_memory: false}\n"
-    ).network
+    section = "network: {listen: [tcp/0.0.0.0:7447], connect: tls/base.local:7447, shared_memory: false}\n"
+    network = load_text(head + section).network
     assert network.listen == ("tcp/0.0.0.0:7447",)
     assert network.connect == ("tls/base.local:7447",)
     assert not network.shared_memory

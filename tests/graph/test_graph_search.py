@@ -67,7 +67,7 @@ def test_the_current_folder_comes_last(tmp_path: Path, monkeypatch: pytest.Monke
     assert sys.path[-3:] == search.FOLDERS
 
 
-def test_a_module_that_is_not_found_says_where_it_was_sought(tmp_path: Path) -> None:
+def test_missing_module_names_the_searched_folders(tmp_path: Path) -> None:
     with pytest.raises(GraphError) as caught:
         load_graph(graph(tmp_path / "g.yaml", "operators: {a: {use: 'sensors:Camera'}}"))
 

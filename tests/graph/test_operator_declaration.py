@@ -61,85 +61,62 @@ def test_a_declaration_is_read_whole() -> None:
     assert spec.process_takes == ("image", "pose", "clouds", "context")
 
 
-P = "\n    def process(self, image):\n        return None\n"
+FAULTY = """\
+class X(Operator): image: int = In(); PROCESS
+  X.image: is a In port and must be annotated In[...]
+class X(Operator): image = In(); PROCESS
+  X.image: is a port without a type: write `image: In[Image]`
+class X(Operator): image: In[Image]; gain = Param(1, doc='g'); PROCESS
+  X.gain: is a parameter without a type
+class X(Operator): image: In[int]; PROCESS
+  X.image: needs a message type: In[Image]
+class X(Operator): image: In[Nothing]; PROCESS
+  X.(annotations): name 'Nothing' is not defined
+class X(Operator): image: In[Image] = Out(); PROCESS
+  X.image: is annotated In[...] but set to a Out
+class X(Operator): context: In[Image]; PROCESS
+  X.context: is a name that Operator uses; choose another for the port
+class X(Operator): image: In[Image]; setup: int = Param(1, doc='r'); PROCESS
+  choose another for the parameter
+class X(Operator): a: Out[Image]; def process(self): ...
+  X.(inputs): nothing makes it fire
+class X(Operator, every='0s'): image: In[Image]; PROCESS
+  X.every: must be positive, got '0s'
+class X(Operator, merge=True, tolerance='1ms'): image: In[Image]; PROCESS
+  X.tolerance: has no meaning with merge=True
+class X(Operator): image: In[Image] = In(many=True); other: In[Image]; PROCESS
+  X.image: many=True on one of several joined inputs
+class X(Operator): image: In[Image]
+  X.process: is missing: define process(self, image)
+class X(Operator): image: In[Image]; def process(self, imge): ...
+  takes 'imge', which is no input
+class X(Operator): image: In[Image]; def process(self): ...
+  does not take the input 'image'
+class X(Operator): image: In[Image]; def process(self, **all): ...
+  instead of *all
+class X(Operator): image: In[Image]; out: Out[Pose]; def process(self, image) -> Image | None: ...
+  X.process: returns Image, but out emits Pose
+class X(Operator): image: In[Image]; def process(self, image) -> Image: ...
+  X.process: returns one message, but has 0 outputs (none): return a mapping
+class X(Operator): image: In[Image]; out: Out[Pose]; def process(self, image) -> Found | None: ...
+  X.process: returns 'pose', which is no output; outputs: out
+class X(Operator): image: In[Image]; pose: Out[Image]; def process(self, image) -> Found: ...
+  X.process: returns Pose, but pose emits Image
+class X(Operator): image: In[Image]; out: Out[Pose]; PROCESS; def finish(self) -> Image: ...
+  X.finish: returns Image, but out emits Pose
+class X(Source): image: In[Image]; out: Out[Image]
+  X.image: a source has no inputs
+class X(Source): gain: int = Param(1, doc='g')
+  X.(outputs): a source needs at least one Out[...]
+"""
+"""Statements of a class, of which PROCESS is a method that takes the image; what is said about it."""
 
 
-@pytest.mark.parametrize(
-    ("head", "body", "said"),
-    [
-        ("Operator", "    image: int = In()" + P, "X.image: is a In port and must be annotated In[...]"),
-        ("Operator", "    image = In()" + P, "X.image: is a port without a type: write `image: In[Image]`"),
-        ("Operator", "    image: In[Image]\n    gain = Param(1, doc='g')" + P, "X.gain: is a parameter without a type"),
-        ("Operator", "    image: In[int]" + P, "X.image: needs a message type: In[Image]"),
-        ("Operator", "    image: In[Nothing]" + P, "X.(annotations): name 'Nothing' is not defined"),
-        ("Operator", "    image: In[Image] = Out()" + P, "X.image: is annotated In[...] but set to a Out"),
-        (
-            "Operator",
-            "    context: In[Image]" + P,
-            "X.context: is a name that Operator uses; choose another for the port",
-        ),
-        (
-            "Operator",
-            "    image: In[Image]\n    setup: int = Param(1, doc='r')" + P,
-            "choose another for the parameter",
-        ),
-        (
-            "Operator",
-            "    a: Out[Image]\n    def process(self):\n        return None\n",
-            "X.(inputs): nothing makes it fire",
-        ),
-        ("Operator, every='0s'", "    image: In[Image]" + P, "X.every: must be positive, got '0s'"),
-        (
-            "Operator, merge=True, tolerance='1ms'",
-            "    image: In[Image]" + P,
-            "X.tolerance: has no meaning with merge=True",
-        ),
-        (
-            "Operator",
-            "    image: In[Image] = In(many=True)\n    other: In[Image]" + P,
-            "X.image: many=True on one of several joined inputs",
-        ),
-        ("Operator", "    image: In[Image]\n", "X.process: is missing: define process(self, image)"),
-        (
-            "Operator",
-            "    image: In[Image]\n    def process(self, imge):\n        pass\n",
-            "takes 'imge', which is no input",
-        ),
-        ("Operator", "    image: In[Image]\n    def process(self):\n        pass\n", "does not take the input 'image'"),
-        ("Operator", "    image: In[Image]\n    def process(self, **all):\n        pass\n", "instead of *all"),
-        (
-            "Operator",
-            "    image: In[Image]\n    out: Out[Pose]\n    def process(self, image) -> Image | None:\n        pass\n",
-            "X.process: returns Image, but out emits Pose",
-        ),
-        (
-            "Operator",
-            "    image: In[Image]\n    def process(self, image) -> Image:\n        pass\n",
-            "X.process: returns one message, but has 0 outputs (none): return a mapping",
-        ),
-        (
-            "Operator",
-            "    image: In[Image]\n    out: Out[Pose]\n    def process(self, image) -> Found | None:\n        pass\n",
-            "X.process: returns 'pose', which is no output; outputs: out",
-        ),
-        (
-            "Operator",
-            "    image: In[Image]\n    pose: Out[Image]\n    def process(self, image) -> Found:\n        pass\n",
-            "X.process: returns Pose, but pose emits Image",
-        ),
-        (
-            "Operator",
-            "    image: In[Image]\n    out: Out[Pose]" + P + "    def finish(self) -> Image:\n        pass\n",
-            "X.finish: returns Image, but out emits Pose",
-        ),
-        ("Source", "    image: In[Image]\n    out: Out[Image]\n", "X.image: a source has no inputs"),
-        ("Source", "    gain: int = Param(1, doc='g')\n", "X.(outputs): a source needs at least one Out[...]"),
-    ],
-)
+@pytest.mark.parametrize(("head", "body", "said"), re.findall(r"class X\((.*?)\): (.*)\n  (.*)\n", FAULTY))
 def test_a_faulty_declaration_names_the_attribute(head: str, body: str, said: str) -> None:
-    code = f"class X({head}):\n{body}"
+    lines = body.replace("PROCESS", "def process(self, image): ...").split("; ")
     with pytest.raises(OperatorDefinitionError) as caught:
-        exec(code, dict(NAMES))
+        exec("\n    ".join([f"class X({head}):", *lines]), dict(NAMES))
 
     assert said in str(caught.value)
 

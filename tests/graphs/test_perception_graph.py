@@ -184,7 +184,7 @@ def test_real_frames_become_a_scene_graph_that_verifies(
 
 
 @pytest.mark.parametrize("name", ["perception", "perception_rgbd", "perception_kitti"])
-def test_one_parameter_says_where_networks_compute(name: str) -> None:
+def test_one_parameter_sets_the_provider_of_all_networks(name: str) -> None:
     nodes = load_graph(
         REPOSITORY / "graphs" / f"{name}.yaml", settings=["provider=cuda", "perception.embed=true"]
     ).nodes

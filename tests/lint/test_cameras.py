@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 
 from dataflow.lint.look import lint
 from dataflow.messages import CameraInfo, CompressedImage, Image, Message
@@ -50,7 +50,7 @@ def info(frame: str, width: int, height: int, cx: float = 30, cy: float = 20) ->
     ],
 )
 def test_a_calibration_of_other_images_is_named(streams: dict[str, list[Message]], stream: str, told: str) -> None:
-    found = [f for f in lint(MadeMaterial(streams), clocks=False).findings if f.check == "calibration"]
+    found = [f for f in lint(MadeInput(streams), clocks=False).findings if f.check == "calibration"]
 
     assert [f.stream for f in found] == [stream]
     assert re.search(told, found[0].text)
@@ -65,4 +65,4 @@ def test_calibrations_of_all_sizes_of_a_camera_and_of_other_cameras_are_right() 
         "other": images("d", 16, 12),
     }
 
-    assert not [f for f in lint(MadeMaterial(streams), clocks=False).findings if f.check == "calibration"]
+    assert not [f for f in lint(MadeInput(streams), clocks=False).findings if f.check == "calibration"]

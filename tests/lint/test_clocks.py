@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lint_material import MadeMaterial, simulated
+from lint_inputs import MadeInput, simulated
 
 import dataflow
 from dataflow.lint.clocks import clock_difference
@@ -24,7 +24,7 @@ def turning(times: np.ndarray, rate, offset: float = 0.0, drift: float = 0.0) ->
     fine = np.linspace(true[0], true[-1], 20_000)
     turned = np.concatenate([[0.0], np.cumsum(np.diff(fine) * (rate(fine[1:]) + rate(fine[:-1])) / 2)])
     at = np.interp(true, fine, turned)
-    return Turning(0, times[:-1], times[1:], np.diff(at) / np.diff(times))
+    return Turning(times[:-1], times[1:], np.diff(at) / np.diff(times))
 
 
 def swaying(t: np.ndarray) -> np.ndarray:
@@ -46,8 +46,8 @@ def test_any_offset_and_drift_is_found_with_its_sign(offset: float, drift: float
 def test_two_that_do_not_turn_alike_tell_nothing() -> None:
     times = np.arange(0.0, 30.0, 0.02)
     noise = np.random.default_rng(3).uniform(0, 1, len(times) - 1)
-    still = Turning(0, times[:-1], times[1:], np.zeros(len(times) - 1))
-    assert clock_difference(Turning(0, times[:-1], times[1:], noise), turning(times, swaying)) is None
+    still = Turning(times[:-1], times[1:], np.zeros(len(times) - 1))
+    assert clock_difference(Turning(times[:-1], times[1:], noise), turning(times, swaying)) is None
     assert clock_difference(still, turning(times, swaying)) is None
     assert clock_difference(turning(times[:20], swaying), turning(times, swaying)) is None
 
@@ -79,7 +79,7 @@ def test_a_camera_that_sways_for_four_seconds_has_no_clock_to_be_judged(tmp_path
 
 
 def report(contract: Contract | None = None, **sensors: object) -> Report:
-    return lint(MadeMaterial(simulated(**sensors)), contract)
+    return lint(MadeInput(simulated(**sensors)), contract)
 
 
 def clock_findings(found: Report) -> dict[tuple[str, str], dict[str, float]]:
@@ -117,7 +117,7 @@ def test_the_sign_is_turned_where_the_contract_trusts_the_gyroscope() -> None:
 
 
 @pytest.mark.long
-def test_an_outage_of_the_wheels_is_a_gap_and_the_clocks_are_still_told() -> None:
+def test_wheel_outage_is_a_gap_and_clocks_are_still_estimated() -> None:
     found = report(wheels={"outages": [[10, 13]]})
     gaps = {f.stream: dict(f.values or {}) for f in found.findings if f.check == "gap"}
     assert set(gaps) == {"robot1/wheel_ticks", "robot1/wheel_odometry"}

@@ -66,5 +66,5 @@ def test_frames_of_the_contract_must_be_there() -> None:
     assert texts(made, "map") == ["the root 'map' is in no message"]
 
 
-def test_without_transforms_nobody_says_how_frames_hang_together() -> None:
+def test_frames_without_transforms_are_not_judged() -> None:
     assert texts(tree(imu=imu("imu"), other=imu("other"))) == []

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.interop.opening import open_bag
-from dataflow.lint.bags import BagMaterial
+from dataflow.lint.bags import BagInput
 from dataflow.lint.look import lint
 
 BEGIN = 1_700_000_000 * SECOND
@@ -33,10 +33,10 @@ def bag(folder: Path) -> Path:
 
 def test_timestamps_are_taken_from_headers_else_from_the_recording(tmp_path: Path) -> None:
     opened = open_bag(bag(tmp_path))
-    material = BagMaterial(opened)
-    assert material.stamps("/imu")[:6].tolist() == [BEGIN + k * TENTH for k in (0, 1, 2, 3, 4, 4)]
-    assert material.stamps("/text").tolist() == [BEGIN + k * SECOND for k in range(9)]
-    assert [message.stamp for message in material.messages("/imu")][:2] == [BEGIN, BEGIN + TENTH]
+    data = BagInput(opened)
+    assert data.stamps("/imu")[:6].tolist() == [BEGIN + k * TENTH for k in (0, 1, 2, 3, 4, 4)]
+    assert data.stamps("/text").tolist() == [BEGIN + k * SECOND for k in range(9)]
+    assert [message.stamp for message in data.messages("/imu")][:2] == [BEGIN, BEGIN + TENTH]
     opened.close()
 
 
@@ -52,7 +52,7 @@ def test_planted_faults_of_a_bag_are_named(tmp_path: Path) -> None:
 def told(folder: Path, rows: list[Row], *, declared: tuple[str, ...] = ()) -> list[tuple[str, str, str]]:
     """(check, stream, text) of what is found in a bag."""
     opened = open_bag(write_ros2(folder / "bag", rows, declared=declared))
-    report = lint(BagMaterial(opened))
+    report = lint(BagInput(opened))
     opened.close()
     return [(finding.check, finding.stream, finding.text) for finding in report.findings]
 

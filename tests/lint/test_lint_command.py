@@ -24,7 +24,7 @@ def demo(repository: Path) -> Path:
     return repository / "recordings" / "demo.mcap"
 
 
-def test_the_bundled_recording_is_sound_and_its_cameras_clock_is_told(demo: Path) -> None:
+def test_bundled_recording_is_sound_and_its_camera_clock_is_estimated(demo: Path) -> None:
     found = json.loads(call("lint", demo, "--json").stdout)
     assert found["sound"]
     assert found["clocks"]["robot1/robot/image_jpeg"]["likeness"] > 0.9
@@ -71,7 +71,7 @@ def test_a_recording_without_a_stream_is_not_called_sound(tmp_path: Path) -> Non
         ("a: [", "no YAML"),
     ],
 )
-def test_a_faulty_contract_says_where_and_what_would_be_right(tmp_path: Path, text: str, words: str) -> None:
+def test_faulty_contract_is_refused_with_place_and_hint(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "c.yaml"
     file.write_text(text)
     with pytest.raises(ContractError) as raised:

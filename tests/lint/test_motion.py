@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 from scipy.spatial.transform import Rotation
 
 from dataflow.lint.motion import check_motion
@@ -33,20 +33,15 @@ def w_first(quaternion: np.ndarray) -> np.ndarray:
     return quaternion[[3, 0, 1, 2]]
 
 
+def sensed(stamp: int, turning: Any, pull: Any = (0, 0, 9.81), orientation: Any = None) -> Imu:
+    return Imu(stamp=stamp, frame="imu", orientation=orientation, angular_velocity=turning, linear_acceleration=pull)
+
+
 def imu(
     orientation: Callable[[np.ndarray], np.ndarray] = lambda q: q, rate: float = 1.0, pull: float = 9.81
 ) -> list[Message]:
-    up = TURNS.inv().apply([0.0, 0.0, pull])
-    return [
-        Imu(
-            stamp=s,
-            frame="imu",
-            orientation=orientation(TURNS[i].as_quat()),
-            angular_velocity=rate * w,
-            linear_acceleration=up[i],
-        )
-        for i, (s, w) in enumerate(zip(STAMPS, rates(), strict=True))
-    ]
+    up, quaternions = TURNS.inv().apply([0.0, 0.0, pull]), map(orientation, TURNS.as_quat())
+    return list(map(sensed, STAMPS, rate * rates(), up, quaternions))
 
 
 def odometry(velocity: Callable[[int], Any] = lambda _: FORWARD, unit: float = 1.0) -> list[Message]:
@@ -68,13 +63,13 @@ def odometry(velocity: Callable[[int], Any] = lambda _: FORWARD, unit: float = 1
 
 
 def found(**streams: list[Message]) -> list[str]:
-    return [finding.text for finding in check_motion(MadeMaterial(streams))]
+    return [finding.text for finding in check_motion(MadeInput(streams))]
 
 
 @pytest.mark.parametrize(
-    ("messages", "told"),
+    ("messages", "mistake"),
     [
-        (imu(w_first), r"\(w, x, y, z\)"),
+        (imu(w_first), "(w, x, y, z)"),
         (imu(lambda q: q * [-1, -1, -1, 1]), "are inverted"),
         (imu(rate=np.degrees(1.0)), "in degrees"),
         (imu(pull=-9.81), "points down"),
@@ -85,10 +80,10 @@ def found(**streams: list[Message]) -> list[str]:
         (odometry(lambda _: -FORWARD), "the opposite sign"),
     ],
 )
-def test_a_motion_that_contradicts_itself_is_named_with_its_mistake(messages: list[Message], told: str) -> None:
+def test_a_motion_that_contradicts_itself_is_named_with_its_mistake(messages: list[Message], mistake: str) -> None:
     (text,) = found(stream=messages)
 
-    assert told.replace("\\", "") in text
+    assert mistake in text
 
 
 def test_a_motion_that_agrees_stands_still_or_is_not_stated_is_sound() -> None:
@@ -106,18 +101,7 @@ def test_what_no_single_mistake_explains_is_not_judged() -> None:
 
 
 def test_a_level_robot_at_rest_shows_its_quaternions_by_its_acceleration() -> None:
-    at_rest = [
-        Imu(
-            stamp=s,
-            frame="imu",
-            orientation=[1.0, 0, 0, 0],
-            angular_velocity=np.zeros(3),
-            linear_acceleration=[0, 0, 9.81],
-        )
-        for s in STAMPS
-    ]
-
-    (text,) = found(imu=at_rest)
+    (text,) = found(imu=[sensed(s, np.zeros(3), orientation=[1.0, 0, 0, 0]) for s in STAMPS])
 
     assert "(w, x, y, z)" in text
 
@@ -132,10 +116,7 @@ def mounted(turn: Rotation) -> list[Message]:
 
 
 def test_an_inverted_mount_is_named_by_the_turning_of_both_its_frames() -> None:
-    gyro = [
-        Imu(stamp=s, frame="imu", angular_velocity=w, linear_acceleration=[0, 0, 9.81])
-        for s, w in zip(STAMPS, MOUNT.inv().apply(rates()), strict=True)
-    ]
+    gyro = list(map(sensed, STAMPS, MOUNT.inv().apply(rates())))
     poses: list[Message] = [
         Pose(stamp=s, frame="map", child_frame="body", position=np.zeros(3), orientation=TURNS[i].as_quat())
         for i, s in enumerate(STAMPS)
@@ -159,16 +140,8 @@ def test_a_real_sensor_is_sound_and_its_quaternions_as_its_file_has_them_are_nam
     truth /= np.linalg.norm(truth, axis=1)[:, None]
 
     def messages(order: list[int]) -> list[Message]:
-        return [
-            Imu(
-                stamp=round(i * period * 1e9),
-                frame="imu",
-                orientation=truth[i, order],
-                angular_velocity=gyro[i],
-                linear_acceleration=pull[i],
-            )
-            for i in np.flatnonzero(np.isfinite(truth).all(axis=1))
-        ]
+        whole = np.flatnonzero(np.isfinite(truth).all(axis=1))
+        return [sensed(round(i * period * 1e9), gyro[i], pull[i], truth[i, order]) for i in whole]
 
     assert found(imu=messages([1, 2, 3, 0])) == []
     (text,) = found(imu=messages([0, 1, 2, 3]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 
 from dataflow.lint.look import lint
 from dataflow.messages import CameraInfo, Image, Message, PointCloud
@@ -25,7 +25,7 @@ def cloud(stamp: int, frame: str) -> Message:
 
 
 def found(messages: list[Message]) -> list[str]:
-    return [f.text for f in lint(MadeMaterial({"a": messages}), clocks=False).findings if f.check == "publishers"]
+    return [f.text for f in lint(MadeInput({"a": messages}), clocks=False).findings if f.check == "publishers"]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 
 from dataflow.lint.look import lint
 from dataflow.messages import DepthImage, Image16, Imu, LaserScan, Message, NavSatFix, PointCloud
@@ -61,7 +61,7 @@ STAMPS = every(0.1)
     ],
 )
 def test_what_cannot_be_is_named_with_the_unit_that_makes_sense(messages: list[Message], told: str) -> None:
-    found = [f.text for f in lint(MadeMaterial({"a": messages})).findings if f.check == "quantity"]
+    found = [f.text for f in lint(MadeInput({"a": messages})).findings if f.check == "quantity"]
 
     assert len(found) == 1
     assert told in found[0]
@@ -77,16 +77,16 @@ def test_what_can_be_is_not_named() -> None:
         "upper": [sloping(s, "<").replace(data=sloping(s, "<").data << 8) for s in STAMPS],
     }
 
-    assert not [f for f in lint(MadeMaterial(sound)).findings if f.check in ("quantity", "clocks")]
+    assert not [f for f in lint(MadeInput(sound)).findings if f.check in ("quantity", "clocks")]
 
 
 def test_streams_that_are_decades_apart_are_of_two_clocks() -> None:
     now = 1_700_000_000 * 10**9
-    material = MadeMaterial(
+    data = MadeInput(
         {"a": [imu(now + s) for s in STAMPS], "b": [imu(now + s) for s in STAMPS], "c": [imu(s) for s in STAMPS]}
     )
 
-    (found,) = [f for f in lint(material).findings if f.check == "clocks"]
+    (found,) = [f for f in lint(data).findings if f.check == "clocks"]
 
     assert (found.stream, found.severity) == ("c", "error")
     assert "53.9 years earlier" in found.text
@@ -95,6 +95,6 @@ def test_streams_that_are_decades_apart_are_of_two_clocks() -> None:
 def test_one_stamp_that_is_decades_off_is_named() -> None:
     now = 1_700_000_000 * 10**9
 
-    found = lint(MadeMaterial({"a": [imu(0), *(imu(now + s) for s in STAMPS)]})).findings
+    found = lint(MadeInput({"a": [imu(0), *(imu(now + s) for s in STAMPS)]})).findings
 
     assert any(f.check == "clocks" and "some are of another clock" in f.text for f in found)

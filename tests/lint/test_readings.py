@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from lint_material import MadeMaterial, every
+from lint_inputs import MadeInput, every
 
 from dataflow.lint.readings import check_readings
 from dataflow.messages import CompressedImage, MagneticField, Measurement, Message, Odometry, Pose
@@ -66,9 +66,9 @@ Make = Callable[[int, int], Message]
     ],
 )
 def test_readings_that_cannot_be_are_named(make: Make, told: str) -> None:
-    material = MadeMaterial({"s": [make(k, s) for k, s in enumerate(STAMPS)]})
+    data = MadeInput({"s": [make(k, s) for k, s in enumerate(STAMPS)]})
 
-    found = [finding.text for finding in check_readings(material)]
+    found = [finding.text for finding in check_readings(data)]
 
     assert [told in text for text in found] == ([True] if told else [])
 
@@ -79,4 +79,4 @@ def test_a_velocity_that_is_not_given_is_no_reading() -> None:
         for t in STAMPS
     ]
     assert still[0].linear is None
-    assert list(check_readings(MadeMaterial({"/odom": still}))) == []
+    assert list(check_readings(MadeInput({"/odom": still}))) == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lint_material import BEGIN, SECOND, MadeMaterial, every
+from lint_inputs import BEGIN, SECOND, MadeInput, every
 
 from dataflow.lint.contract import Contract
 from dataflow.lint.look import lint
@@ -16,7 +16,7 @@ from dataflow.lint.timing import check_gaps, check_order, timing_of
 
 
 def findings(stamps: dict[str, list[int]], contract: Contract | None = None) -> list[tuple[str, str]]:
-    return [(f.check, f.stream) for f in lint(MadeMaterial({}, stamps), contract).findings]
+    return [(f.check, f.stream) for f in lint(MadeInput({}, stamps), contract).findings]
 
 
 def test_a_sound_recording_has_no_findings() -> None:
@@ -25,7 +25,7 @@ def test_a_sound_recording_has_no_findings() -> None:
 
 def test_a_gap_is_named_with_its_length_place_and_what_is_missing() -> None:
     stamps = [s for s in every(0.1) if not 3.05 <= (s - BEGIN) / SECOND < 5.05]
-    (found,) = lint(MadeMaterial({}, {"a": stamps, "b": every(0.1)})).findings
+    (found,) = lint(MadeInput({}, {"a": stamps, "b": every(0.1)})).findings
     assert (found.check, found.stream, found.at) == ("gap", "a", BEGIN + 3 * SECOND)
     assert found.values == {"gaps": 1, "longest_s": pytest.approx(2.1), "missing": 20}
     assert "the longest 2.1 s; about 20 messages are missing" in found.text
@@ -55,16 +55,9 @@ def test_streams_that_begin_late_or_end_early_are_named() -> None:
 
 
 def test_a_contract_bounds_rates_and_gaps_and_names_streams() -> None:
-    terms = Contract.model_validate(
-        {
-            "streams": {
-                "imu": {"rate": [95, 105]},
-                "camera/*": {"rate": [9, 11], "max_gap": "250ms"},
-                "gnss": {},
-                "radio": {"optional": True},
-            }
-        }
-    )
+    imu, camera = {"rate": [95, 105]}, {"rate": [9, 11], "max_gap": "250ms"}
+    streams = {"imu": imu, "camera/*": camera, "gnss": {}, "radio": {"optional": True}}
+    terms = Contract.model_validate({"streams": streams})
     stamps = {"robot1/imu": every(0.02), "robot1/camera/left": every(0.1), "robot1/camera/right": every(0.1)}
     stamps["robot1/camera/right"] = [s for s in stamps["robot1/camera/right"] if (s - BEGIN) // 10**8 not in (50, 51)]
     assert sorted(findings(stamps, terms)) == [

@@ -15,6 +15,7 @@ from dataflow.supervision.configs import configurations
 from dataflow.supervision.core.commands import Command, Over, Send, Signal, Spawn
 from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
+from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan, process_plans
 
 WALL = 1_700_000_000.0
@@ -167,17 +168,28 @@ class Play:
     def stops(self) -> list[Command]:
         return self.tell(StopAsked())
 
-    def ends(self) -> Over:
+    def ends(self) -> RunReport:
         """All processes hand in their reports, and the run closes."""
         self.tell(*(self.ended(label) for label in self.processes))
         self.wait(5.0)
-        assert self.over is not None
-        return self.over
+        return self.report
 
-    def failure(self) -> str:
+    @property
+    def report(self) -> RunReport:
+        """The report of a run that has ended in order."""
+        assert self.over is not None
+        assert self.over.report is not None
+        return self.over.report
+
+    @property
+    def failed_by(self) -> RunFailed:
+        """The failure of a run that has ended early."""
         assert self.over is not None
         assert self.over.failure is not None
-        return str(self.over.failure)
+        return self.over.failure
+
+    def failure(self) -> str:
+        return str(self.failed_by)
 
 
 def sent(commands: list[Command], kind: str) -> list[tuple[str, Mapping[str, Any]]]:

@@ -42,7 +42,7 @@ class Children:
         self.sent.append((label, kind))
 
 
-def test_a_process_is_told_of_the_clock_only_once_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_offset_is_sent_only_to_running_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks = Clocks()
     clocks.exchanged(100, 1600, 1700, 1200)
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace(clocks=clocks))
@@ -114,7 +114,7 @@ def test_a_file_that_differs_is_outside_or_is_too_large_is_refused(
         there._obey("", "file", piece(b"6", 5, last=True, whole=b"x"))
 
 
-def test_a_machine_says_what_it_lacks_and_in_what_it_differs(stay: tuple[Stay, list[Any]], tmp_path: Path) -> None:
+def test_machine_reports_missing_files_and_differences(stay: tuple[Stay, list[Any]], tmp_path: Path) -> None:
     there, said = stay
     (tmp_path / "same.yaml").write_bytes(b"same")
     digests = {"same.yaml": hashed(b"same"), "new": hashed(b"new")}
@@ -143,11 +143,7 @@ def test_a_machine_says_what_it_lacks_and_in_what_it_differs(stay: tuple[Stay, l
         (events.Aborted("no memory"), ("", "failed", {"why": "no memory"})),
         (
             events.Remained("sum", Remains({"sum": [b"x"]}, {"sum": Reached(2, {"mean": 5})})),
-            (
-                "sum",
-                "remained",
-                {"batches": {"sum": [b"x"]}, "reached": {"sum": [*astuple(Reached(2, {"mean": 5}))]}},
-            ),
+            ("sum", "remained", {"batches": {"sum": [b"x"]}, "reached": {"sum": [*astuple(Reached(2, {"mean": 5}))]}}),
         ),
     ],
     ids=["said", "hung up", "not reading", "died", "left behind", "aborted", "remained"],
@@ -160,9 +156,7 @@ def test_news_of_processes_go_to_the_supervisor(
     assert said == [word]
 
 
-def test_a_process_is_configured_for_this_machine_and_goes_by_its_clock(
-    stay: tuple[Stay, list[Any]],
-) -> None:
+def test_a_process_is_configured_for_this_machine_and_goes_by_its_clock(stay: tuple[Stay, list[Any]]) -> None:
     """The clock here is 1.5 s behind the supervisor's."""
     there, _ = stay
     given: list[tuple[str, dict[str, Any]]] = []

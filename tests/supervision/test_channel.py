@@ -53,7 +53,7 @@ def answer(channel: QueuedChannel) -> tuple[str, dict[str, object]]:
             return message
 
 
-def test_a_stopped_process_blocks_nobody_and_finds_the_latest_news_when_it_goes_on(
+def test_stopped_process_blocks_no_sender_and_reads_the_latest_message(
     stopped: tuple[QueuedChannel, subprocess.Popen[bytes]],
 ) -> None:
     channel, process = stopped

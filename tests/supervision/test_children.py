@@ -124,7 +124,7 @@ def test_a_channel_that_is_closed_is_hung_up_once(scene: Scene) -> None:
     assert scene.hears(End(scene.a, 0)) == [Died("a", 0)]
 
 
-def test_what_processes_leave_behind_is_told_with_their_names(scene: Scene) -> None:
+def test_leftover_processes_are_reported_by_name(scene: Scene) -> None:
     found = scene.hears(Leftovers((scene.b, scene.a), ("sleep (process 12)",)))
     assert found == [LeftBehind(("b", "a"), ("sleep (process 12)",))]
 
@@ -137,7 +137,7 @@ def ticked(scene: Scene, seconds: float) -> list[Event]:
     return scene.events[before:]
 
 
-def test_a_process_that_takes_nothing_for_a_while_is_told_of_until_it_reads(scene: Scene) -> None:
+def test_not_reading_is_reported_until_the_process_reads(scene: Scene) -> None:
     assert ticked(scene, 10.0) == []  # nothing waits for it
     for _ in range(2):
         scene.children.send("a", "grow", {"data": bytes(400_000)})
@@ -152,7 +152,7 @@ def test_a_process_that_takes_nothing_for_a_while_is_told_of_until_it_reads(scen
     assert ticked(scene, 10.0) == []
 
 
-def test_one_for_which_more_waits_than_is_kept_is_told_of_at_once(scene: Scene) -> None:
+def test_overflow_of_a_channel_is_reported_at_once(scene: Scene) -> None:
     for _ in range(6):
         scene.children.send("a", "grow", {"data": bytes(400_000)})
     (event,) = ticked(scene, 0.1)

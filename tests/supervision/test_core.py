@@ -21,9 +21,10 @@ from dataflow.supervision.core.events import (
     Said,
     Tick,
 )
+from dataflow.supervision.core.life import how_it_ended
 from dataflow.supervision.core.report import OperatorCounts
-from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof, Verdict
-from dataflow.supervision.core.wording import how_it_ended, how_long
+from dataflow.supervision.core.watchers.lateness import how_long
+from dataflow.supervision.core.watchers.quiescence import MAX_WINDOW_DOUBLINGS, Proof
 from dataflow.sync import FOREVER
 
 
@@ -97,11 +98,10 @@ def test_a_run_starts_and_ends_without_waiting_for_a_tick() -> None:
     assert play.core.status.phase == "running"
     play.tell(*(play.ended(label) for label in play.processes))
 
-    assert play.over is not None
-    assert play.over.failure is None
+    assert play.report
 
 
-def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
+def test_recorder_leaves_last() -> None:
     play = Play(record="run.mcap").starts()
 
     given = play.tell(*(play.ended(label) for label in play.processes))
@@ -109,8 +109,7 @@ def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
     assert [label for label, _ in sent(given, "leave")] == ["left", "sum", "@recorder"]
     assert dict(sent(play.commands, "leave"))["@recorder"]["outcome"] == "complete"
     assert Withdraw() in play.commands
-    assert play.over is not None
-    assert play.over.report is not None
+    assert play.report
 
 
 def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
@@ -146,9 +145,7 @@ def test_the_first_death_ends_the_run_with_how_far_it_was_and_its_last_words() -
     play.wait(1.0)
 
     assert play.failure() == "process 'sum' was killed by SIGSEGV while running (sum had reached stamp 5)"
-    assert play.over is not None
-    assert play.over.failure is not None
-    assert play.over.failure.details == "a segment is at fault"
+    assert play.failed_by.details == "a segment is at fault"
     assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: process 'sum' was killed")
 
 
@@ -174,7 +171,7 @@ def test_a_process_that_closes_its_channel_and_does_not_end_is_killed() -> None:
     assert "closed its channel and did not end" in play.failure()
 
 
-def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> None:
+def test_stall_kills_and_names_processes_without_answer() -> None:
     play = Play(stall_timeout=20.0).starts()
     play.deaf.add("sum")
     play.tell(Said("sum", "beat", {"memory": 1, "work": None}))
@@ -186,16 +183,14 @@ def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> 
     assert "sum" in killed(play.commands)
 
 
-def test_a_stuck_graph_is_proven_and_who_waits_is_named() -> None:
+def test_stuck_graph_is_proven_and_waiting_operators_are_named() -> None:
     play = Play().starts()
 
     play.state = {"waiting": {"sum": [7, {"x": 5}]}}
     play.wait(2.0)
 
     assert play.failure() == "the graph is stuck: nothing is on its way and no operator can fire"
-    assert play.over is not None
-    assert play.over.failure is not None
-    assert play.over.failure.details == "  sum waits at stamp 7 for x (≥ 5)"
+    assert play.failed_by.details == "  sum waits at stamp 7 for x (≥ 5)"
 
 
 def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
@@ -234,9 +229,7 @@ def test_a_rate_at_which_nothing_is_ever_due_is_named() -> None:
 def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
     play = Play().starts()
     assert {label for label, _ in sent(play.stops(), "stop")} == {"left", "sum"}
-    over = play.ends()
-    assert over.report is not None
-    assert over.report.interrupted
+    assert play.ends().interrupted
 
     play = Play().starts()
     play.stops()
@@ -244,9 +237,7 @@ def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
     play.stops()
     play.wait(2.0)
     assert play.failure() == "stopped before everything was drained"
-    assert play.over is not None
-    assert play.over.failure is not None
-    assert play.over.failure.interrupted
+    assert play.failed_by.interrupted
 
 
 def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> None:
@@ -257,11 +248,9 @@ def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> 
     play.deaf.discard("sum")
     play.tell(Said("sum", "closed", {"facts": {}}))
     play.dies("sum", 0)
-    over = play.wait(1.0) and play.over
+    play.wait(1.0)
 
-    assert over is not None
-    assert over.report is not None
-    assert (over.report.interrupted, over.report.wall, over.report.streams) == (True, 0.0, {})
+    assert (play.report.interrupted, play.report.wall, play.report.streams) == (True, 0.0, {})
     assert [fields["outcome"] for _, fields in sent(play.commands, "leave")] == ["interrupted"] * 3
     assert sent(play.commands, "go") == []
     assert killed(play.commands) == []
@@ -276,10 +265,8 @@ def test_a_process_that_is_still_starting_at_ctrl_c_is_killed_soon_and_that_is_n
 
     assert killed(play.commands) == ["sum"]
     assert asked_where(play.commands) == []
-    assert play.over is not None
-    assert play.over.report is not None
-    assert play.over.report.interrupted
-    assert play.over.report.notes == ("still starting, and killed: process 'sum'",)
+    assert play.report.interrupted
+    assert play.report.notes == ("still starting, and killed: process 'sum'",)
     assert sent(play.commands, "leave")[-1][1]["outcome"] == "interrupted"
 
 
@@ -304,7 +291,7 @@ def test_a_second_ctrl_c_while_starting_does_not_wait() -> None:
     assert play.failure() == "stopped before everything was closed"
 
 
-def test_a_run_that_always_finds_more_to_do_ends_in_time_and_says_what_it_owed() -> None:
+def test_endless_draining_is_bounded_and_reports_what_is_owed() -> None:
     play = Play(stall_timeout=30.0).starts()
     play.tell(play.progress("left", {"left": 1_800_000_000}))
     play.stops()
@@ -318,9 +305,7 @@ def test_a_run_that_always_finds_more_to_do_ends_in_time_and_says_what_it_owed()
         "sum was at stamp (28|29|30) after 1 firings, sources had given up to 1800000000",
         play.failure(),
     )
-    assert play.over is not None
-    assert play.over.failure is not None
-    assert play.over.failure.interrupted
+    assert play.failed_by.interrupted
 
 
 @pytest.mark.parametrize(("patience", "closes_within"), [(120.0, 60.0), (8.0, 8.0), (1.0, 5.0)])
@@ -346,9 +331,7 @@ def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_l
     play.tell(Printed("sum", 'File "driver.py", line 7 in release'))
     play.wait(2.0)
 
-    assert play.over is not None
-    assert play.over.failure is not None
-    details = play.over.failure.details
+    details = play.failed_by.details
     assert '[sum] File "driver.py", line 7 in release' in details
     assert "[sum] sum 0" in details
     assert "[left] left 9" in details
@@ -358,10 +341,7 @@ def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_l
 def test_what_a_process_has_left_behind_is_named() -> None:
     play = Play().starts()
     play.tell(LeftBehind(("sum",), ("sleep (process 12)",)), LeftBehind(("left", "sum"), ("cat (process 13)",)))
-    over = play.ends()
-
-    assert over.report is not None
-    assert over.report.notes == (
+    assert play.ends().notes == (
         "process 'sum' left processes behind, which were killed: sleep (process 12)",
         "process 'left' or 'sum' left processes behind, which were killed: cat (process 13)",
     )
@@ -404,18 +384,13 @@ def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> No
 def test_what_was_sent_and_not_received_counts_as_lost_only_after_a_while_in_which_nothing_moves(
     lost_after: float | None,
 ) -> None:
-    proof, under_way = (
-        Proof(lost_after),
-        [{"idle": True, "sent": 5, "received": 2}, {"idle": True, "sent": 1, "received": 3}],
-    )
-    assert proof.judge([{**under_way[0], "idle": False}], 0.0) is Verdict.MOVING
-    assert [proof.judge(under_way, now) for now in (1.0, 5.9)] == [Verdict.SETTLED] * 2
-    assert proof.judge(under_way, 6.0) is (Verdict.SETTLED if lost_after is None else Verdict.PROVEN)
+    proof = Proof(lost_after)
+    under_way = [{"idle": True, "sent": 5, "received": 2}, {"idle": True, "sent": 1, "received": 3}]
+    assert not proof.judge([{**under_way[0], "idle": False}], 0.0)
+    assert [proof.judge(under_way, now) for now in (1.0, 5.9)] == [False] * 2
+    assert proof.judge(under_way, 6.0) is (lost_after is not None)
     more = [under_way[0], {**under_way[1], "received": 4}]
-    assert [proof.judge(more, now) for now in (7.0, 7.1)] == [
-        Verdict.SETTLED,
-        Verdict.PROVEN,
-    ]
+    assert [proof.judge(more, now) for now in (7.0, 7.1)] == [False, True]
 
 
 def test_a_window_is_doubled_only_so_often() -> None:
@@ -498,9 +473,7 @@ def test_a_report_has_what_processes_handed_in() -> None:
     for label, each in counts.items():
         handed_in = {"counts": each, "streams": {}, "transport": {"sent": 1}, "expected": 0, **more.get(label, {})}
         play.tell(Said(label, "ended", {"report": handed_in}))
-    assert play.over is not None
-    report = play.over.report
-    assert report is not None
+    report = play.report
     assert report.digests() == {"test/left/fast": "abc"}
     assert report.operators["left"] == OperatorCounts(3, 6, 0, 9, 90, 12)
     assert (report.drops, report.waits) == ({"sum": (("x", "full", 2),)}, {"sum": (("x", "late", 1),)})
@@ -512,30 +485,9 @@ def test_a_report_has_what_processes_handed_in() -> None:
     assert leave["@recorder"]["summaries"] == {"sum": {"mean": 4.5}}
 
 
-@pytest.mark.parametrize(
-    ("code", "text"),
-    [
-        (0, "exited with code 0"),
-        (3, "exited with code 3"),
-        (-11, "was killed by SIGSEGV"),
-        (-99, "was killed by signal 99"),
-        (None, "ended in a way that is not known"),
-    ],
-)
-def test_how_a_process_ended_is_said_in_words(code: int | None, text: str) -> None:
-    assert how_it_ended(code) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (119.6, "120 s"),
-        (7199, "7199 s"),
-        (7200, "2 hours"),
-        (86400, "24 hours"),
-        (172800, "2 days"),
-        (1e9, "31.7 years"),
-    ],
-)
-def test_a_span_is_said_in_words(seconds: float, text: str) -> None:
-    assert how_long(seconds) == text
+def test_exit_codes_and_spans_in_words() -> None:
+    codes = {3: "exited with code 3", -11: "was killed by SIGSEGV", -99: "was killed by signal 99"}
+    assert {code: how_it_ended(code) for code in codes} == codes
+    assert how_it_ended(None) == "ended in a way that is not known"
+    spans = {119.6: "120 s", 7199: "7199 s", 7200: "2 hours", 86400: "24 hours", 172800: "2 days", 1e9: "31.7 years"}
+    assert {seconds: how_long(seconds) for seconds in spans} == spans

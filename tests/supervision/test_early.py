@@ -72,7 +72,7 @@ def test_a_graph_with_other_threads_gets_a_nursery_of_its_own(monkeypatch: pytes
     assert started == ["2"]
 
 
-def test_a_nursery_that_nobody_takes_is_ended_at_once() -> None:
+def test_unused_early_nursery_is_ended_at_once() -> None:
     with early_nursery() as early:
         pid = nursery_of(early)
         assert runs(pid)
@@ -80,7 +80,7 @@ def test_a_nursery_that_nobody_takes_is_ended_at_once() -> None:
     assert not runs(pid)
 
 
-def test_one_that_has_died_is_replaced() -> None:
+def test_dead_early_nursery_is_replaced() -> None:
     with early_nursery() as early:
         assert early._nursery is not None
         early._nursery._process.kill()
@@ -90,7 +90,7 @@ def test_one_that_has_died_is_replaced() -> None:
     assert report.summaries["sum"]["count"] == 5
 
 
-def test_threads_are_those_of_the_graph_unless_it_says_nothing() -> None:
+def test_early_nursery_has_the_default_thread_count() -> None:
     with early_nursery() as early:
         taken = early.take(1)
 

@@ -46,7 +46,7 @@ def test_rates_and_load_are_those_since_the_last_update() -> None:
     assert health.level == Level.OK
 
 
-def test_an_operator_that_drops_says_how_many() -> None:
+def test_dropping_operator_reports_the_number() -> None:
     health = after((10.0, 100, 4, 1.0), (12.0, 140, 10, 2.0))
 
     assert (health.state, health.drop_rate, health.note) == ("dropping", 3.0, "6 dropped in 2.0 s")
@@ -97,7 +97,7 @@ def test_one_that_is_slow_by_nature_is_given_longer() -> None:
     assert after(*slow, (14.0 + 11.0, 7, 0, 0.0)).state == "silent"
 
 
-def test_one_that_is_away_or_through_says_so_before_anything_else() -> None:
+def test_restarting_and_ended_take_precedence() -> None:
     monitor = HealthMonitor()
     of: Counts = {"gone": counts(5), "through": counts(5)}
     monitor.update(of, 0.0)
@@ -117,7 +117,7 @@ def test_counts_that_begin_anew_with_a_new_process_are_no_negative_rates() -> No
     assert (again.state, again.rate, again.drop_rate, round(again.load, 6)) == ("running", 3.0, 0.0, 0.1)
 
 
-def test_drops_are_told_by_input_and_reason() -> None:
+def test_drops_are_reported_by_input_and_reason() -> None:
     monitor = HealthMonitor()
     drops = {"op": {("image", "overflow"): 3, ("image", "late"): 1, ("", "past"): 2}}
 
@@ -128,7 +128,7 @@ def test_drops_are_told_by_input_and_reason() -> None:
     assert told == {"dropped.image.overflow": "3", "dropped.image.late": "1", "dropped.past": "2"}
 
 
-def test_the_diagnostics_stream_says_the_same() -> None:
+def test_diagnostics_stream_matches_health() -> None:
     healths = [
         Health("camera", "silent", 7, 7, 0, 0.0, 0.0, 0.0, 0.0, 0, "nothing for 3.0 s"),
         Health("detector", "dropping", 9, 9, 4, 5.0, 2.0, 0.9, 1.0, 1, "4 dropped in 2.0 s"),

@@ -66,7 +66,7 @@ def test_an_operator_is_behind_by_what_its_sources_have_given() -> None:
     assert behind.covered(["right"], 30) == 270
 
 
-def test_a_source_that_has_given_nothing_leaves_nobody_behind() -> None:
+def test_source_without_messages_causes_no_lag() -> None:
     behind = flow()
     behind.reached("left", 100)
     behind.reached("left", 900)
@@ -77,7 +77,7 @@ def test_a_source_that_has_given_nothing_leaves_nobody_behind() -> None:
     assert behind.covered(["right"], 0) == NEVER
 
 
-def test_a_window_that_nobody_counts_for_is_never_full() -> None:
+def test_window_without_consumers_is_never_full() -> None:
     window = Window(2, 1000)
     window.add(1, 2, 10)
     assert window.full

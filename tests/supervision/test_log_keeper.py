@@ -38,7 +38,7 @@ def test_lines_are_handed_on_in_order_a_few_at_a_look() -> None:
     assert run.sent[1:] == [[str(AT_ONCE), str(AT_ONCE + 1)]]
 
 
-def test_a_flood_is_cut_and_says_how_much_is_missing() -> None:
+def test_flood_of_log_lines_is_cut_and_counted() -> None:
     logs, run = keeper()
     for k in range(KEPT + 7):
         logs.take(LogLine("info", str(k)))

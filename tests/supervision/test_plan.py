@@ -226,7 +226,7 @@ def test_a_part_of_a_recording_begins_where_it_was_cut() -> None:
     assert plan_replay(recorded(FAST, cut=7_000_000_000), graph(), start=0.5).start == 7_500_000_000
 
 
-def test_a_stream_that_is_lacking_and_taken_is_named_with_who_takes_it() -> None:
+def test_missing_stream_is_named_with_its_consumer() -> None:
     with pytest.raises(
         ReplayError, match=r"no stream of 'left' is in the recording \(looked for .*; it holds test/smooth"
     ):

@@ -62,7 +62,7 @@ def test_one_process_needs_no_link() -> None:
     assert pairs_of(made.graph, process_plans(made)) == {}
 
 
-def test_what_all_processes_are_told_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shared_configuration_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a hundred processes, all links would be looked for two hundred times."""
     asked = Counter[str]()
 

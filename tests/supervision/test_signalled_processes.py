@@ -21,13 +21,15 @@ BY_NUMBER = {"kill", "killpg"}
 NOT_WAITED_FOR_YET = {
     "supervision/nursery.py": 1,
     "supervision/nursery_process.py": 3,
+    "parent.py": 1,
     "process/start.py": 1,
     "sweep/warm_process.py": 2,
     "tool_server/jobs.py": 1,
     "verification/workers/prestart.py": 1,
     "verification/workers/worker.py": 1,
 }
-"""Where a number is used: by the parent, of a child that it waits for only afterwards, which keeps the number taken."""
+"""Where a number is used: by the parent, of a child that it waits for only afterwards, which keeps the number taken; in
+`parent.py` by a process for itself."""
 
 
 @pytest.fixture

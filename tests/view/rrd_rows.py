@@ -1,4 +1,4 @@
-"""Reads what a sink saved: rows of (entity, component, stamp or None, values)."""
+"""Draws messages into a file, and reads what a sink saved: rows of (entity, component, stamp or None, values)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import rerun as rr
 from rerun.chunk import RrdReader
+
+from dataflow.messages import Message
+from dataflow.view import SceneState, ViewOptions, visualize
+from dataflow.view.layout import layout
 
 
 class Row(NamedTuple):
@@ -27,6 +32,26 @@ def blueprint_rows(path: Path) -> list[Row]:
     """Every component value of the blueprints in the file."""
     reader = RrdReader(path)
     return [row for store in reader.blueprints() for chunk in reader.stream(store=store) for row in _rows(chunk)]
+
+
+def draw(
+    tmp_path: Path,
+    *drawn: tuple[str, Message],
+    static: tuple[str, ...] = (),
+    options: ViewOptions | None = None,
+    scene: SceneState | None = None,
+) -> list[Row]:
+    """What a viewer gets when these messages of these streams are drawn in order."""
+    types = {stream: type(message) for stream, message in drawn}
+    scene = scene or SceneState(layout(types, static=static), options or ViewOptions())
+    path = tmp_path / "drawn.rrd"
+    with rr.RecordingStream("test", recording_id="test") as recording:
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        recording.save(path)
+        for stream, message in drawn:
+            visualize(recording, f"/{stream}", message, scene, stream)
+    return rows(path)
 
 
 def at(found: list[Row], entity: str, component: str) -> list[Row]:

@@ -31,7 +31,7 @@ def test_poses_compose_along_the_tree() -> None:
     assert tree.assumed() == {}
 
 
-def test_frames_that_nobody_places_hang_under_the_root_and_are_marked() -> None:
+def test_unplaced_frames_hang_under_the_root_and_are_marked() -> None:
     tree = FrameTree()
     assert tree.see("camera") == [NewRoot("camera")]
     assert tree.see("camera") == []
@@ -133,7 +133,7 @@ def test_a_pose_of_a_stamp_is_that_of_then_and_of_no_other_time() -> None:
     assert tree.pose_at("nowhere", 10) is None
 
 
-def test_a_frame_that_nobody_places_has_no_pose_of_a_stamp() -> None:
+def test_unplaced_frame_has_no_pose_at_a_stamp() -> None:
     tree = FrameTree()
     tree.see("map")
     tree.see("camera")

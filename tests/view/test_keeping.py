@@ -12,10 +12,9 @@ from dataflow.messages import Message, Odometry, PointCloud
 from dataflow.view.layout import layout
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
-    import rerun as rr
-    from rrd_rows import at, rows
+    from rrd_rows import at, draw
 
-    from dataflow.view import SceneState, ViewOptions, visualize
+    from dataflow.view import SceneState, ViewOptions
     from dataflow.view.visualizers.clouds import KeptPoints, Points
 
 
@@ -72,27 +71,17 @@ def test_points_too_far_off_for_a_cell_are_left_out() -> None:
 def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tmp_path: Path) -> None:
     types: dict[str, type[Message]] = {"r/cloud": PointCloud, "r/odometry": Odometry}
     state = SceneState(replace(layout(types), kept=frozenset({"r/cloud"})), ViewOptions(kept_after=2))
-    path = tmp_path / "drawn.rrd"
-    with rr.RecordingStream("test", recording_id="test") as recording:
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        recording.save(path)
-        for k in range(4):  # the robot drives on, the wall stays, and each pose comes after its cloud
-            points = np.array([[5.0 - k, 0.0, 1.0]], np.float32)
-            cloud = PointCloud(stamp=10 * k, frame="base", points=points)
-            odometry = Odometry(
-                stamp=10 * k,
-                frame="odom",
-                child_frame="base",
-                position=np.array([float(k), 0, 0]),
-                orientation=np.array([0, 0, 0, 1.0]),
-            )
-            visualize(recording, "/r/cloud", cloud, state, "r/cloud")
-            visualize(recording, "/r/odometry", odometry, state, "r/odometry")
-    (drawn_points,) = at(rows(path), "/r/cloud/space/kept", "Points3D:positions")
+    told: list[tuple[str, Message]] = []
+    for k in range(4):  # the robot drives on, the wall stays, and each pose comes after its cloud
+        pose = {"position": [float(k), 0, 0], "orientation": [0, 0, 0, 1]}
+        points = np.array([[5.0 - k, 0.0, 1.0]], np.float32)
+        told.append(("r/cloud", PointCloud(stamp=10 * k, frame="base", points=points)))
+        told.append(("r/odometry", Odometry(stamp=10 * k, frame="odom", child_frame="base", **pose)))
+    found = draw(tmp_path, *told, scene=state)
+    (drawn_points,) = at(found, "/r/cloud/space/kept", "Points3D:positions")
     assert np.allclose(drawn_points.values, [[5.0, 0.0, 1.0]])
     assert drawn_points.stamp == 10, "the second cloud that saw it"
-    frames = at(rows(path), "/r/cloud/space/kept", "CoordinateFrame:frame")
+    frames = at(found, "/r/cloud/space/kept", "CoordinateFrame:frame")
     assert frames[-1].values == ["odom"]
     assert all(frame.stamp is None for frame in frames), (
         "a viewer that shows later points, too, knows their frame at any time"

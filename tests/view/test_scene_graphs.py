@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,15 +9,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.messages import Activity, Message, SceneGraph
+from dataflow.messages import Activity, SceneGraph
 from dataflow.messages.scene_summary import summarize
-from dataflow.view.layout import layout
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
-    import rerun as rr
-    from rrd_rows import Row, at, rows
+    from rrd_rows import at, draw
 
-    from dataflow.view import SceneState, visualize
     from dataflow.view.visualizers.scene_tree import arranged
 
 CLASSES = ("room", "floor", "table", "mug", "chair", "person", "book")
@@ -51,18 +47,6 @@ def walking(stamp: int = 0) -> Activity:
         stamp=stamp, class_names=("walking",), subjects=np.array([4]), class_ids=np.array([0], np.int32),
         scores=np.array([0.9], np.float32),
     )  # fmt: skip
-
-
-def draw(tmp_path: Path, *drawn: tuple[str, Message]) -> list[Row]:
-    types: Mapping[str, type[Message]] = {stream: type(message) for stream, message in drawn}
-    state, path = SceneState(layout(types)), tmp_path / "drawn.rrd"
-    with rr.RecordingStream("test", recording_id="test") as recording:
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        recording.save(path)
-        for stream, message in drawn:
-            visualize(recording, f"/{stream}", message, state, stream)
-    return rows(path)
 
 
 def test_rooms_and_floors_are_outlines_on_the_ground_and_hide_nothing(tmp_path: Path) -> None:
@@ -125,7 +109,7 @@ def test_what_has_not_changed_is_not_sent_again(tmp_path: Path) -> None:
     assert len(at(found, "/s/graph/text", "TextDocument:text")) == 2
 
 
-def test_the_list_says_who_does_what_and_what_carries_what(tmp_path: Path) -> None:
+def test_text_lists_activities_and_what_carries_what(tmp_path: Path) -> None:
     found = draw(tmp_path, ("s/activities", walking()), ("s/graph", scene()))
     (text,) = at(found, "/s/graph/text", "TextDocument:text")
     assert "| **person 4** | walking 90 %, heads for chair 3 (70 %) |" in text.values[0]

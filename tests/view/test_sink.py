@@ -30,6 +30,7 @@ from dataflow.messages import (
 )
 from dataflow.operator import FINDING
 from dataflow.recording import Recording, RecordingWriter
+from dataflow.view.layout import layout
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     import rerun.blueprint as rrb
@@ -175,7 +176,7 @@ STREAMS = {
 
 
 def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
-    assert views(blueprint(STREAMS)) == [
+    assert views(blueprint(layout(STREAMS))) == [
         ("3D", "World"),
         ("Graph", "Scene graph"),
         ("2D", "camera/image"),
@@ -190,16 +191,17 @@ def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
         ("StateTimeline", "Status"),
         ("TextLog", "Log"),
     ]
-    assert views(blueprint({"r/imu/data": Imu}))[-1] == ("TextLog", "Log")
-    assert ("3D", "World") not in views(blueprint({"r/imu/data": Imu}))
+    imu_alone = views(blueprint(layout({"r/imu/data": Imu})))
+    assert imu_alone[-1] == ("TextLog", "Log")
+    assert ("3D", "World") not in imu_alone
 
 
 def test_there_is_no_world_where_nothing_has_depth_or_a_place() -> None:
     flat = {"r/camera/image": Image, "r/camera/info": CameraInfo, "r/detector/boxes": Detections2D}
 
-    assert ("3D", "World") not in views(blueprint(flat))
-    assert ("3D", "World") in views(blueprint({**flat, "r/camera/depth": DepthImage}))
-    assert ("3D", "World") in views(blueprint({**flat, "r/odometry/pose": Pose}))
+    assert ("3D", "World") not in views(blueprint(layout(flat)))
+    assert ("3D", "World") in views(blueprint(layout({**flat, "r/camera/depth": DepthImage})))
+    assert ("3D", "World") in views(blueprint(layout({**flat, "r/odometry/pose": Pose})))
 
 
 def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
@@ -208,7 +210,7 @@ def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
             return list(part.contents) if part.name == name else []
         return [line for inner in part.contents for line in contents(name, inner)]
 
-    root = blueprint(STREAMS).root_container
+    root = blueprint(layout(STREAMS)).root_container
     assert contents("camera/image", root) == [
         "+ /r/camera/image",
         "+ /r/camera/image/scale/**",
@@ -266,17 +268,8 @@ def test_curves_get_their_view_when_they_are_first_drawn(late: bool, tmp_path: P
 @pytest.mark.parametrize("placed", [False, True])
 def test_tracks_without_places_and_a_status_without_figures_get_no_view(placed: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.rrd"
-    tracks = Tracks(
-        stamp=STAMP,
-        frame="c",
-        boxes=[[0, 0, 2, 2]],
-        ids=[1],
-        states=[1],
-        scores=[1],
-        class_ids=[0],
-        ages=[3],
-        unseen=[0],
-    )
+    one = {"ids": [1], "states": [1], "scores": [1], "class_ids": [0], "ages": [3], "unseen": [0]}
+    tracks = Tracks(stamp=STAMP, frame="c", boxes=[[0, 0, 2, 2]], **one)
     status = Diagnostics(stamp=STAMP, names=["n"], levels=[0], messages=["ok"])
     if placed:
         tracks = tracks.replace(positions=[[1, 0, 0]])
@@ -356,10 +349,7 @@ def test_a_stream_that_is_not_shown_wins_no_frame_from_one_that_is_and_brings_no
         for k in range(3):
             sink.log("wheels", placed_by("wheel_odom", k, 9.0))
             sink.log("scan", scan(STAMP + k))
-            sink.log(
-                "shown",
-                Pose(stamp=STAMP + k, frame="world", child_frame="lidar", position=[2, 0, 0], orientation=[0, 0, 0, 1]),
-            )
+            sink.log("shown", placed_by("world", k, 2.0))
     found = rows(path)
     assert {row.values[0] for row in at(found, "/frames/lidar", "Transform3D:parent_frame")} == {"world"}
     assert not [row for row in found if row.entity == "/frames/wheel_odom"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,13 +42,12 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view.layout import layout
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     import rerun as rr
-    from rrd_rows import Row, at, rows
+    from rrd_rows import Row, at, draw
 
-    from dataflow.view import SceneState, ViewOptions, colors, visualize
+    from dataflow.view import ViewOptions, colors
     from dataflow.view.drawing import roles_of
 
 TYPES = [
@@ -58,22 +56,6 @@ TYPES = [
     if isinstance(value, type) and issubclass(value, Message) and value is not Message
 ]
 STAMP = 1_700_000_000_123_456_789
-
-
-def draw(
-    tmp_path: Path, *drawn: tuple[str, Message], static: tuple[str, ...] = (), options: ViewOptions | None = None
-) -> list[Row]:
-    """What a viewer gets when these messages of these streams are drawn in order."""
-    types: Mapping[str, type[Message]] = {stream: type(message) for stream, message in drawn}
-    scene = SceneState(layout(types, static=static), options or ViewOptions())
-    path = tmp_path / "drawn.rrd"
-    with rr.RecordingStream("test", recording_id="test") as recording:
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        recording.save(path)
-        for stream, message in drawn:
-            visualize(recording, f"/{stream}", message, scene, stream)
-    return rows(path)
 
 
 def test_every_message_type_has_a_visualizer_of_its_own() -> None:
@@ -297,7 +279,7 @@ def test_poses_in_quick_succession_are_drawn_seldom_but_their_frames_placed_with
 
 @pytest.mark.parametrize("late", [-5, 0, 5])
 @pytest.mark.parametrize("order", list(permutations(["color", "depth", "odom", "mounts"])), ids="-".join)
-def test_mounts_hold_whenever_they_are_told(tmp_path: Path, order: tuple[str, ...], late: int) -> None:
+def test_mounts_hold_in_any_order_of_arrival(tmp_path: Path, order: tuple[str, ...], late: int) -> None:
     mounts = Transforms(
         stamp=STAMP + late,
         frames=["base", "depth"],
@@ -414,7 +396,7 @@ def test_an_orientation_is_drawn_as_roll_pitch_and_yaw_in_degrees(tmp_path: Path
     np.testing.assert_allclose(row.values, [10, -20, 130])
 
 
-def test_diagnostics_are_told_when_they_change_and_plotted_by_kind(tmp_path: Path) -> None:
+def test_diagnostics_are_logged_on_change_and_plotted_by_kind(tmp_path: Path) -> None:
     def health(t: int, level: int) -> Diagnostics:
         return Diagnostics(
             stamp=STAMP + t, names=("camera",), messages=("fine" if level == 0 else "hot",), levels=[level],
@@ -438,7 +420,7 @@ class Weather(Message, schema="tests.view.Weather"):
     gusts: object = array("float32", "N", "of the last minute, m/s")
 
 
-def test_a_type_without_a_visualiser_is_plotted_and_told(tmp_path: Path) -> None:
+def test_type_without_visualiser_is_plotted_and_logged(tmp_path: Path) -> None:
     def weather(t: int, sky: str) -> Weather:
         return Weather(stamp=STAMP + t, temperature=20.5, sky=sky, wind=[3, 4], gusts=[5, 6, 7])
 

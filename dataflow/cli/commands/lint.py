@@ -22,8 +22,8 @@ from dataflow.cli.support.arguments import (
 from dataflow.cli.support.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
+    from dataflow.lint.inputs import LintInput
     from dataflow.lint.look import Report
-    from dataflow.lint.material import Material
 
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -74,35 +74,35 @@ def lint(
             terms = None if contract is None else load_contract(existing(contract, "a contract"))
         except ContractError as error:
             raise fail(str(error)) from None
-        with _material(existing_recording(recording)) as material:
-            report = look(material, terms, clocks=not quick)
+        with _input(existing_recording(recording)) as data:
+            report = look(data, terms, clocks=not quick)
             shown(finding.text for finding in report.findings)
             if write is not None:
-                name, namespace = recording.stem, material.namespace
-                text = proposed(name, namespace, material.streams, report.timings, report.root)
+                name, namespace = recording.stem, data.namespace
+                text = proposed(name, namespace, data.streams, report.timings, report.root)
                 write.write_text(text, encoding="utf-8")
     if json:
         print_json(report.to_json())
     else:
-        _print(report, f"{material.namespace}/" if material.namespace else "", write)
+        _print(report, f"{data.namespace}/" if data.namespace else "", write)
     if not report.sound:
         raise typer.Exit(DIFFERENT)
 
 
 @contextmanager
-def _material(path: Path) -> Iterator[Material]:
+def _input(path: Path) -> Iterator[LintInput]:
     """A recording of ours, or a bag."""
     from dataflow.interop.opening import is_foreign, open_bag
-    from dataflow.lint.bags import BagMaterial
-    from dataflow.lint.material import RecordedMaterial
+    from dataflow.lint.bags import BagInput
+    from dataflow.lint.inputs import RecordingInput
     from dataflow.recording import Recording
 
     if is_foreign(path):
         with closing(open_bag(path)) as bag:
-            yield BagMaterial(bag)
+            yield BagInput(bag)
     else:
         with Recording(path) as opened:
-            yield RecordedMaterial(opened)
+            yield RecordingInput(opened)
 
 
 def _print(report: Report, prefix: str, written: Path | None) -> None:

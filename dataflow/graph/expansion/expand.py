@@ -20,7 +20,7 @@ from dataflow.graph.expansion.wiring import OR, Wiring
 from dataflow.graph.keys import NAME_RULE, has_wildcard, key_fault, name_fault
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.model import current_path
-from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
+from dataflow.graph.problems import Place, Problems, did_you_mean
 from dataflow.graph.yaml import document
 from dataflow.graph.yaml.fields import Fields
 from dataflow.graph.yaml.limits import MAX_DEPTH, MAX_OPERATORS, Budget
@@ -85,8 +85,7 @@ def _report(full: str, cls: type[Operator], fault: Any, given: Table, place: Pla
             if fault["type"] == "string_type" and isinstance(value, Leaf) and not isinstance(value.value, str):
                 hint = f"write '{value.raw}' in quotes"
             elif fault["type"] in ("literal_error", "enum") and isinstance(value, Leaf):
-                near = nearest(str(value.value), re.findall(r"'([^']*)'", message))
-                hint = f"did you mean {near!r}?" if near else hint
+                hint = did_you_mean(str(value.value), re.findall(r"'([^']*)'", message)) or hint
             said = value.raw if isinstance(value, Leaf) else describe(value)
             problems.add(value.place, f"{full}: parameter {name!r}: {message}, got {said}", hint)
 
@@ -161,13 +160,12 @@ class Expander:
         table = self.top(tree, scope)
         if table is None:
             return None
-        name = self.fields.name(table.get("graph"), "graph")
+        named = self.fields.label(table.get("graph"), "graph", "name")
         if "graph" not in table.entries:
             self.problems.add(table.place, "the graph has no name", "begin with 'graph: some_name'")
-        namespace = self.fields.namespace(table.get("namespace")) or name or "graph"
-        self.out = Expansion(table, name or "graph", namespace)
-        scope = Scope(file, shown, "", namespace, {}, {}, None, None, None, None, (file,))
-        self.body(table, scope)
+        name = named.value if named else "graph"
+        self.out = Expansion(table, name, self.fields.namespace(table.get("namespace")) or name)
+        self.body(table, replace(scope, key=self.out.namespace))
         self.unused_settings()
         return self.out
 
@@ -249,12 +247,9 @@ class Expander:
                     carried = replace(carried, value=carried.value.removesuffix(OPTIONAL).strip())
                 declared[name] = (entry.key.place, self.message_type(carried, name))
         if scope.use is None:
+            hint = "a graph with inputs runs inside another graph: name this file there with 'use:'"
             for name, (place, _) in declared.items():
-                self.problems.add(
-                    place,
-                    f"graph input {name!r} is bound to nothing",
-                    "a graph with inputs runs inside another graph: name this file there with 'use:'",
-                )
+                self.problems.add(place, f"graph input {name!r} is bound to nothing", hint)
             return {name: GraphInput((), kind, place) for name, (place, kind) in declared.items()}
         for name, (place, _) in scope.bindings.items():
             if name not in declared:
@@ -272,12 +267,8 @@ class Expander:
                 choices = (Choice((), Absence(reason, scope.prefix)),)
             elif bound is None:
                 wanted = f" ({kind.SCHEMA})" if kind else ""
-                self.problems.add(
-                    scope.use,
-                    f"{scope.prefix[:-1]}: input {name!r}{wanted} of {scope.shown} is not given",
-                    f"add 'inputs: {{{name}: ...}}'",
-                    [(place, "declared here")],
-                )
+                text = f"{scope.prefix[:-1]}: input {name!r}{wanted} of {scope.shown} is not given"
+                self.problems.add(scope.use, text, f"add 'inputs: {{{name}: ...}}'", [(place, "declared here")])
             inputs[name] = GraphInput(choices, kind, place)
             self.out.graph_inputs.append((f"{scope.prefix}{name}", inputs[name]))
         return inputs
@@ -290,9 +281,7 @@ class Expander:
             return None
         known = message_types()
         if schema not in known:
-            near = nearest(schema, known)
-            hint = f"did you mean {near!r}?" if near else ""
-            self.problems.add(tree.place, f"unknown message type {schema!r}", hint)
+            self.problems.add(tree.place, f"unknown message type {schema!r}", did_you_mean(schema, known))
         return known.get(schema)
 
     # -- one operator --------------------------------------------------------------------------------------------
@@ -367,13 +356,12 @@ class Expander:
         prefix = f"{scope.key}/{name}"
         if not self.condition(full, table, scope, inputs):
             return
-        if file in scope.stack:
-            way = " -> ".join(self.shown(f) for f in (*scope.stack[scope.stack.index(file) :], file))
-            self.problems.add(place, f"graph nests in itself: {way}")
-            self.out.broken.append(prefix)
-            return
-        if len(scope.stack) >= MAX_DEPTH:
-            self.problems.add(place, f"graphs nest deeper than {MAX_DEPTH}")
+        if file in scope.stack or len(scope.stack) >= MAX_DEPTH:
+            within = scope.stack[scope.stack.index(file) :] if file in scope.stack else ()
+            way = " -> ".join(self.shown(f) for f in (*within, file))
+            self.problems.add(
+                place, f"graph nests in itself: {way}" if within else f"graphs nest deeper than {MAX_DEPTH}"
+            )
             self.out.broken.append(prefix)
             return
         tree = self.parse(file, place)
@@ -401,13 +389,14 @@ class Expander:
     # -- settings ------------------------------------------------------------------------------
 
     def unused_settings(self) -> None:
-        known_params = self.fields.table(self.parsed_root_params(), "params")
+        root = next(iter(self.parsed.values()))
+        params = root.get("params") if isinstance(root, Table) else None
+        known = params.entries if isinstance(params, Table) else ()
         for setting in self.settings:
             if setting.used:
                 continue
             if not setting.owner:
-                names = list(known_params.entries) if known_params else []
-                hint = did_you_mean(setting.path[0], names, "graph parameters")
+                hint = did_you_mean(setting.path[0], known, "graph parameters")
                 self.problems.add(setting.place, f"the graph has no parameter {setting.path[0]!r}", hint)
             elif not self.is_broken(setting.owner):
                 hint = did_you_mean(setting.owner, sorted(self.out.names), "operators")
@@ -417,8 +406,3 @@ class Expander:
         """True for an operator that could not be had, or one inside a nested graph that could not."""
         key = f"{self.out.namespace}/{name}/"
         return any(key.startswith(f"{prefix}/") for prefix in self.out.broken)
-
-    def parsed_root_params(self) -> Tree | None:
-        root = next(iter(self.parsed.values()))
-        params = root.get("params") if isinstance(root, Table) else None
-        return params if isinstance(params, Table) else None

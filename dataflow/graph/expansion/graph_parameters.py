@@ -80,11 +80,8 @@ class GraphParameters:
                     self.budget.charge(reference.place, SCALAR_COST)
                     return parse_scalar(word, reference.place)
                 if default is None:
-                    self.problems.add(
-                        reference.place,
-                        f"environment variable {variable!r} is not set",
-                        f"set it, or give a default: ${{env:{variable}:-default}}",
-                    )
+                    hint = f"set it, or give a default: ${{env:{variable}:-default}}"
+                    self.problems.add(reference.place, f"environment variable {variable!r} is not set", hint)
                 return default
             name = reference.name
             if name == FOLDER:
@@ -95,16 +92,12 @@ class GraphParameters:
                 return values[name]
             if name in declared:
                 if default is None:
-                    self.problems.add(
-                        reference.place,
-                        f"graph parameter {name!r} has no value",
-                        f"give one: --set {name}=..., or a default below 'params:'",
-                    )
+                    hint = f"give one: --set {name}=..., or a default below 'params:'"
+                    self.problems.add(reference.place, f"graph parameter {name!r} has no value", hint)
                 return default
             if name in later:
-                self.problems.add(
-                    reference.place, f"graph parameter {name!r} is used before it is defined", "move it up in 'params:'"
-                )
+                text = f"graph parameter {name!r} is used before it is defined"
+                self.problems.add(reference.place, text, "move it up in 'params:'")
             else:
                 hint = did_you_mean(name, declared, "graph parameters")
                 self.problems.add(reference.place, f"unknown graph parameter {name!r}", hint)

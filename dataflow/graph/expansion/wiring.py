@@ -40,22 +40,25 @@ class Wiring:
         for word in words:
             if word in inputs:
                 ways.append(inputs[word].choices)
-            elif (pattern := self.pattern(Leaf(word, leaf.place, word), scope, inputs)) is not None:
+            elif (pattern := read_pattern(Leaf(word, leaf.place, word), scope.key, self.problems, inputs)) is not None:
                 if len(words) > 1 and has_wildcard(pattern.key):
                     self.problems.add(leaf.place, f"{word!r}: streams between '|' are named without wildcards")
                 ways.append((pattern,))
         bound = any(word in inputs for word in words)
         return Choice(tuple(ways), via=leaf.place if bound else None)
 
-    def pattern(self, leaf: Leaf, scope: Scope, inputs: Mapping[str, GraphInput] | None = None) -> Pattern | None:
-        text = leaf.value
-        absolute = text.startswith("/")
-        if fault := key_fault(text[1:] if absolute else text):
-            self.problems.add(leaf.place, f"{text!r} is no key expression: {fault}")
-            return None
-        if not absolute and "/" not in text and not has_wildcard(text) and inputs:
-            hint = did_you_mean(text, inputs, "inputs of this graph")
-            self.problems.add(leaf.place, f"{text!r} is neither an input of this graph nor 'operator/port'", hint)
-            return None
-        key = canonical(text[1:] if absolute else f"{scope.key}/{text}")
-        return Pattern(text, key, leaf.place, scope.key)
+
+def read_pattern(
+    leaf: Leaf, scope: str, problems: Problems, inputs: Mapping[str, GraphInput] | None = None
+) -> Pattern | None:
+    """A text as a key expression, relative to the key prefix `scope`; `inputs`: of the graph that it stands in."""
+    text = leaf.value
+    absolute = text.startswith("/")
+    if fault := key_fault(text[1:] if absolute else text):
+        problems.add(leaf.place, f"{text!r} is no key expression: {fault}")
+        return None
+    if not absolute and "/" not in text and not has_wildcard(text) and inputs:
+        hint = did_you_mean(text, inputs, "inputs of this graph")
+        problems.add(leaf.place, f"{text!r} is neither an input of this graph nor 'operator/port'", hint)
+        return None
+    return Pattern(text, canonical(text[1:] if absolute else f"{scope}/{text}"), leaf.place, scope)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataflow.graph.drafts import Wired
 from dataflow.graph.model import Stream
 from dataflow.graph.problems import Place, Problems
+from dataflow.graph.reach import reached
 from dataflow.graph.resolution.policies import sync_tolerance
 from dataflow.graph.yaml.fields import Fields
 from dataflow.operator import Source
@@ -48,42 +49,27 @@ def refuse_stuck_cycles(wired: Iterable[Wired], streams: Mapping[str, Stream], p
         cycle = stuck_cycle(edges)
         if cycle is None:
             return
-        found = sorted(cycle.edges, key=lambda e: edges.index(e))
-        start = cycle.edges.index(found[0])
+        start = cycle.edges.index(min(cycle.edges, key=edges.index))
         around = (*cycle.edges[start:], *cycle.edges[:start])
         way = " -> ".join([around[0].producer, *(e.consumer for e in around)])
-        place, _ = places[around[0]]
         if any(e.before for e in around):
             what, hint = "cycle whose 'before' is too short", "lengthen it by more than that sum"
         else:
             what, hint = "cycle without 'before'", "declare one of these inputs Sampled(before=True)"
-        problems.add(
-            place,
-            f"{what}: {way} would wait for itself (its demands sum to {format_duration(cycle.demand)}, and must be "
-            "below 0)",
-            hint,
-            [places[e] for e in around],
-        )
+        sums = f"its demands sum to {format_duration(cycle.demand)}, and must be below 0"
+        edge_places = [places[e] for e in around]
+        problems.add(edge_places[0][0], f"{what}: {way} would wait for itself ({sums})", hint, edge_places)
         edges = [e for e in edges if e not in cycle.edges]
 
 
-def fed_by_devices(wired: Iterable[Wired], streams: Mapping[str, Stream], *, live: bool) -> set[str]:
+def fed_by_devices(wired: Sequence[Wired], streams: Mapping[str, Stream], *, live: bool) -> set[str]:
     """Names of the operators that have a source upstream that cannot wait (`Source.real_time`; in a live run, any)."""
-    downstream: dict[str, list[str]] = {}
-    reached: list[str] = []
+    takers: dict[str, set[str]] = {w.draft.name: set() for w in wired}
     for w in wired:
-        if issubclass(w.draft.cls, Source) and (w.draft.cls.real_time or live):
-            reached.append(w.draft.name)
-        for taken in w.inputs.values():
-            for stream in taken:
-                downstream.setdefault(streams[stream].node, []).append(w.draft.name)
-    seen = set(reached)
-    while reached:
-        for name in downstream.get(reached.pop(), ()):
-            if name not in seen:
-                seen.add(name)
-                reached.append(name)
-    return seen
+        for stream in {stream for taken in w.inputs.values() for stream in taken}:
+            takers[streams[stream].node].add(w.draft.name)
+    devices = {w.draft.name for w in wired if issubclass(w.draft.cls, Source) and (w.draft.cls.real_time or live)}
+    return devices | reached(devices, takers.__getitem__)
 
 
 def in_order(wired: Sequence[Wired], streams: Mapping[str, Stream]) -> list[str]:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
-from dataflow.graph.keys import canonical, has_wildcard, key_fault
-from dataflow.graph.model import Bundle, Graph, Node
+from dataflow.graph.expansion.wiring import read_pattern
+from dataflow.graph.keys import has_wildcard
+from dataflow.graph.model import INPUT_CLASS, Bundle, Graph, Node, input_text
 from dataflow.graph.problems import Problems, did_you_mean
-from dataflow.graph.resolution.flight import KEYS as FLIGHT_KEYS
-from dataflow.graph.resolution.flight import read_flight
-from dataflow.graph.resolution.network import read_network
 from dataflow.graph.resolution.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.resolution.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.resolution.presence import said
+from dataflow.graph.resolution.sections import FLIGHT_KEYS, read_flight, read_network
 from dataflow.graph.resolution.streams import Streams
 from dataflow.graph.sections import ON_FAILURE, PANELS, Record, Snapshots, View
 from dataflow.graph.yaml.fields import Fields
@@ -22,8 +21,6 @@ from dataflow.operator import InputPort, is_source
 from dataflow.sync.stamps import format_duration
 
 MAX_THREADS = 256
-
-_INPUT_WORD = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 
 
 class Resolver:
@@ -76,12 +73,9 @@ class Resolver:
     def check_graph_input(self, name: str, declared: GraphInput, pattern: Pattern, stream: str) -> None:
         assert declared.type is not None
         if not all(issubclass(t, declared.type) for t in self.types[stream]):
-            self.problems.add(
-                pattern.place,
-                f"graph input {name!r} takes {declared.type.SCHEMA}, but {self.known.told(stream, pattern.scope)}",
-                self.known.carriers((declared.type,), pattern.scope),
-                [(declared.place, "declared here")],
-            )
+            text = f"graph input {name!r} takes {declared.type.SCHEMA}, but {self.known.told(stream, pattern.scope)}"
+            hint = self.known.carriers((declared.type,), pattern.scope)
+            self.problems.add(pattern.place, text, hint, [(declared.place, "declared here")])
 
     # -- one operator's inputs -----------------------------------------------------------------------------------
 
@@ -99,12 +93,9 @@ class Resolver:
                 continue
             wired.inputs[port.name] = ()
             if port.kind != "sampled" or port.required:
-                self.problems.add(
-                    draft.inputs_place,
-                    f"{draft.name}: input {port.name!r} ({input_text(port)}) is not wired",
-                    self.known.carriers(port.types, self.known.scope_of(draft))
-                    or f"no stream carries {port.type_text()}",
-                )
+                text = f"{draft.name}: input {port.name!r} ({input_text(port)}) is not wired"
+                hint = self.known.carriers(port.types, self.known.scope_of(draft))
+                self.problems.add(draft.inputs_place, text, hint or f"no stream carries {port.type_text()}")
         if spec.every is not None and not is_source(draft.cls):
             self.check_ticks(wired)
         return wired
@@ -135,35 +126,26 @@ class Resolver:
     def check_stream(self, what: str, port: InputPort, pattern: Pattern, stream: str) -> None:
         """The stream's type, and that a static stream is only sampled."""
         if not port.accepts(self.types[stream]):
-            self.problems.add(
-                pattern.place,
-                f"{what} takes {port.type_text()}, but {self.known.told(stream, pattern.scope)}",
-                self.known.carriers(port.types, pattern.scope),
-                self.known.via(pattern),
-            )
+            text = f"{what} takes {port.type_text()}, but {self.known.told(stream, pattern.scope)}"
+            hint = self.known.carriers(port.types, pattern.scope)
         elif self.streams[stream].static and port.kind != "sampled":
-            self.problems.add(
-                pattern.place,
-                f"{what}: {self.known.short(stream, pattern.scope)!r} is static (one message, valid at all times), "
-                f"which {'cannot trigger' if port.kind == 'in' else 'makes no batch'}",
-                f"the operator should declare it {port.name}: Sampled[{port.type_text()}]",
-                self.known.via(pattern),
-            )
+            text = f"{what}: {self.known.short(stream, pattern.scope)!r} is static (one message, valid at all times), "
+            text += f"which {'cannot trigger' if port.kind == 'in' else 'makes no batch'}"
+            hint = f"the operator should declare it {port.name}: Sampled[{port.type_text()}]"
+        else:
+            return
+        self.problems.add(pattern.place, text, hint, self.known.via(pattern))
 
     def too_many(self, draft: Draft, port: InputPort, streams: Mapping[str, Pattern]) -> None:
         first = next(iter(streams.values()))
         joined = len(draft.cls.spec.triggers) > 1 and not draft.cls.spec.merge and port.kind == "in"
         why = "a joined input takes one stream" if joined else "it takes one stream"
         listed = ", ".join(self.known.short(s, first.scope) for s in sorted(streams))
-        hint = "name one of them" if joined else f"name one, or declare the input {_INPUT_WORD[port.kind]}(many=True)"
+        hint = "name one of them" if joined else f"name one, or declare the input {INPUT_CLASS[port.kind]}(many=True)"
         if carriers := self.known.carriers(port.types, first.scope):
             hint += f"; {carriers}"
-        self.problems.add(
-            first.place,
-            f"{draft.name}.{port.name}: {why}, but {len(streams)} match: {listed}",
-            hint,
-            self.known.via(first),
-        )
+        text = f"{draft.name}.{port.name}: {why}, but {len(streams)} match: {listed}"
+        self.problems.add(first.place, text, hint, self.known.via(first))
 
     def check_ticks(self, wired: Wired) -> None:
         """Ticks begin and end with an input that is neither static nor fed back."""
@@ -175,12 +157,9 @@ class Resolver:
         for name, port in spec.inputs.items():
             if not port.before and any(not self.streams[s].static for s in wired.inputs[name]):
                 return
-        self.problems.add(
-            draft.inputs_place,
-            f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
-            "'before': the beginning and the end of ticks are unknown",
-            "wire an input to a stream that is neither",
-        )
+        text = f"{draft.name}: {spec.name} ticks every {format_duration(every)}, but every wired input is static or "
+        text += "'before': the beginning and the end of ticks are unknown"
+        self.problems.add(draft.inputs_place, text, "wire an input to a stream that is neither")
 
     # -- the graph as a whole ------------------------------------------------------------------------------------
 
@@ -194,12 +173,10 @@ class Resolver:
                 mine, other = getattr(draft, key), getattr(first, key)
                 here, there = (leaf.value if leaf else None for leaf in (mine, other))
                 if here != there:
-                    self.problems.add(
-                        (mine or other or draft.process or Leaf(None, draft.place)).place,
-                        f"process {label!r} is {words[0]} two {words[1]}: {first.name} {words[0]} "
-                        f"{there or 'this one'}, {draft.name} {words[0]} {here or 'this one'}",
-                        f"give them the same '{key}:', or different 'process:' labels",
-                    )
+                    at = (mine or other or draft.process or draft).place
+                    text = f"process {label!r} is {words[0]} two {words[1]}: {first.name} {words[0]} "
+                    text += f"{there or 'this one'}, {draft.name} {words[0]} {here or 'this one'}"
+                    self.problems.add(at, text, f"give them the same '{key}:', or different 'process:' labels")
 
     # -- the resolved parts --------------------------------------------------------------------------------------
 
@@ -257,34 +234,23 @@ class Resolver:
         table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep", "every"))
         if table is None:
             return View()
-        panels = []
-        for leaf in self.fields.texts(table.get("panels"), "panels"):
-            if (panel := self.fields.choice(leaf, "panels", {name: name for name in PANELS})) is not None:
-                panels.append(panel)
+        words = self.fields.texts(table.get("panels"), "panels")
+        panels = [self.fields.choice(leaf, "panels", {name: name for name in PANELS}) for leaf in words]
         layout = self.fields.text(table.get("layout"), "layout") or ""
         if layout and not layout.endswith(".rbl"):
-            self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")  # type: ignore[arg-type]
+            self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")
         hidden, kept = (self.topics(table.get(what), what) for what in ("hide", "keep"))
-        return View(hidden, tuple(panels), layout, kept, self.fields.duration(table.get("every"), "every"))
+        every = self.fields.duration(table.get("every"), "every")
+        return View(hidden, tuple(filter(None, panels)), layout, kept, every)
 
     def topics(self, tree: Tree | None, what: str) -> tuple[str, ...]:
         """The streams that a list of key expressions matches; each must match one at least."""
         found: set[str] = set()
-        namespace = self.expansion.namespace
         for leaf in self.fields.texts(tree, what):
-            text = leaf.value
-            absolute = text.startswith("/")
-            if fault := key_fault(text[1:] if absolute else text):
-                self.problems.add(leaf.place, f"{text!r} is no key expression: {fault}")
-                continue
-            key = canonical(text[1:] if absolute else f"{namespace}/{text}")
-            pattern = Pattern(text, key, leaf.place, namespace)
-            streams = self.known.match(pattern)
-            if not streams:
-                self.known.no_match(pattern, what, None)
-            found.update(streams)
+            pattern = read_pattern(leaf, self.expansion.namespace, self.problems)
+            if pattern is not None:
+                streams = self.known.match(pattern)
+                if not streams:
+                    self.known.no_match(pattern, what, None)
+                found.update(streams)
         return tuple(sorted(found))
-
-
-def input_text(port: InputPort) -> str:
-    return f"{_INPUT_WORD[port.kind]}[{port.type_text()}]"

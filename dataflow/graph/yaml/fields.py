@@ -23,14 +23,13 @@ class Fields:
     def __init__(self, problems: Problems) -> None:
         self.problems = problems
 
-    def wrong(self, tree: Tree, what: str, expected: str, hint: str = "") -> None:
-        if not (isinstance(tree, Leaf) and tree.value is UNKNOWN):
+    def wrong(self, tree: Tree | None, what: str, expected: str, hint: str = "") -> None:
+        """Reports a value that is not as expected; none is no fault."""
+        if tree is not None and not (isinstance(tree, Leaf) and tree.value is UNKNOWN):
             self.problems.add(tree.place, f"{what} must be {expected}, not {describe(tree)}", hint)
 
     def table(self, tree: Tree | None, what: str, known: Iterable[str] | None = None) -> Table | None:
         """A mapping; with `known`, every other key is reported. An empty value is None."""
-        if tree is None:
-            return None
         if not isinstance(tree, Table):
             self.wrong(tree, what, "a mapping")
             return None
@@ -43,8 +42,6 @@ class Fields:
         return tree
 
     def text(self, tree: Tree | None, what: str) -> str | None:
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and isinstance(tree.value, str):
             return tree.value
         number = isinstance(tree, Leaf) and isinstance(tree.value, int | float)
@@ -59,16 +56,12 @@ class Fields:
         return [Leaf(word, item.place, word) for item in items if (word := self.text(item, what)) is not None]
 
     def integer(self, tree: Tree | None, what: str, low: int, high: int) -> int | None:
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and type(tree.value) is int and low <= tree.value <= high:
             return tree.value
         self.wrong(tree, what, f"a whole number from {low} to {high}")
         return None
 
     def boolean(self, tree: Tree | None, what: str) -> bool | None:
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and isinstance(tree.value, bool):
             return tree.value
         self.wrong(tree, what, "true or false")
@@ -76,8 +69,6 @@ class Fields:
 
     def duration(self, tree: Tree | None, what: str) -> int | None:
         """Nanoseconds of a duration with a unit; a bare number is refused."""
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and isinstance(tree.value, str):
             try:
                 return parse_duration(tree.value)
@@ -89,8 +80,6 @@ class Fields:
 
     def size(self, tree: Tree | None, what: str) -> int | None:
         """Bytes, from `512MiB`, `2GB` or a plain number of bytes."""
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and type(tree.value) is int and tree.value > 0:
             return tree.value
         if isinstance(tree, Leaf) and isinstance(tree.value, str) and (match := _BYTES.fullmatch(tree.value.strip())):
@@ -99,47 +88,31 @@ class Fields:
         return None
 
     def choice(self, tree: Tree | None, what: str, choices: Mapping[str, Choice]) -> Choice | None:
-        if tree is None:
-            return None
         if isinstance(tree, Leaf) and isinstance(tree.value, str) and tree.value in choices:
             return choices[tree.value]
         word = str(tree.value) if isinstance(tree, Leaf) else ""
         self.wrong(tree, what, f"one of {', '.join(choices)}", did_you_mean(word, choices))
         return None
 
-    def name(self, tree: Tree | None, what: str) -> str | None:
-        """A name of one part, without '/'."""
-        word = self.text(tree, what)
-        if word is None or tree is None:
-            return None
-        if fault := name_fault(word):
-            self.problems.add(tree.place, f"{what} name {fault}", NAME_RULE)
-            return None
-        return word
-
     def namespace(self, tree: Tree | None) -> str | None:
         """Names joined by '/'."""
-        word = self.text(tree, "namespace")
-        if word is None or tree is None:
-            return None
-        for part in word.split("/"):
-            if fault := name_fault(part):
+        leaf = self.path(tree, "namespace")
+        for part in leaf.value.split("/") if leaf else ():
+            if leaf and (fault := name_fault(part)):
                 hint = f"names joined by '/', such as robot1 or site/robot1; {NAME_RULE}"
-                self.problems.add(tree.place, f"namespace {word!r}: {fault}", hint)
+                self.problems.add(leaf.place, f"namespace {leaf.value!r}: {fault}", hint)
                 return None
-        return word
+        return leaf.value if leaf else None
 
     def path(self, tree: Tree | None, what: str) -> Leaf | None:
         """A path, with its place."""
         word = self.text(tree, what)
         return None if word is None or tree is None else Leaf(word, tree.place, word)
 
-    def label(self, tree: Tree | None, what: str) -> Leaf | None:
-        """A name, with its place."""
-        word = self.text(tree, what)
-        if word is None or tree is None:
+    def label(self, tree: Tree | None, what: str, kind: str = "label") -> Leaf | None:
+        """A name of one part, without '/', with its place."""
+        leaf = self.path(tree, what)
+        if leaf and (fault := name_fault(leaf.value)):
+            self.problems.add(leaf.place, f"{what} {kind} {fault}", NAME_RULE)
             return None
-        if fault := name_fault(word):
-            self.problems.add(tree.place, f"{what} label {fault}", NAME_RULE)
-            return None
-        return Leaf(word, tree.place, word)
+        return leaf

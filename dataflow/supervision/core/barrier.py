@@ -7,8 +7,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import RunState
-from dataflow.supervision.core.stack_requests import Asking, notice
+from dataflow.supervision.core.run_state import Asking, RunState, notice
 from dataflow.supervision.core.supervised import Supervised
 
 HEARD_WITHIN = 30.0

@@ -8,13 +8,11 @@ ended only when nothing can go wrong with the others any more. Every step is bou
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 from dataflow.supervision.core.life import Life, Step
-from dataflow.supervision.core.outcome import summaries_of
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Phase, RunState
-from dataflow.supervision.core.stack_requests import Asking, notice
+from dataflow.supervision.core.run_state import Asking, Phase, RunState, notice
 from dataflow.supervision.core.supervised import Supervised
 
 LEAVE_TIMEOUT = 10.0
@@ -31,14 +29,6 @@ def bounded(stall_timeout: float) -> float:
     return max(SHORTEST, min(CLOSE_TIMEOUT, stall_timeout))
 
 
-@dataclass(slots=True)
-class _Stage:
-    """The processes that leave together, and until when."""
-
-    sinks: bool
-    deadline: float
-
-
 class Closing:
     """Lets all processes leave. `failure` is why the run ends early: what fails later is a consequence and noted."""
 
@@ -49,8 +39,9 @@ class Closing:
         self._at_once = at_once
         self._hand_over = hand_over
         self._asking = Asking(run)
+        self._deadline = 0.0
         run.enter(Phase.CLOSING)
-        self._stage = self._begin(sinks=False)
+        self._begin(sinks=False)
 
     @property
     def over(self) -> bool:
@@ -70,57 +61,50 @@ class Closing:
         self._at_once = True
         if self.failure is None:
             self.failure = RunFailed("stopped before everything was closed", interrupted=True)
-        self._stage.deadline = min(self._stage.deadline, self.run.steady + self._time_for(sinks=self._stage.sinks))
+        self._deadline = min(self._deadline, self.run.steady + self._time)
 
     def tick(self) -> None:
         """Goes on when a stage is through, or its time is up."""
-        leaving = self._leaving(sinks=self._stage.sinks)
-        late = self.run.steady > self._stage.deadline
-        ahead = notice(self._time_for(sinks=self._stage.sinks))
-        if self._has_run and self.failure is None and self.run.steady > self._stage.deadline - ahead:
-            self._asking.ask(leaving, self._stage.deadline)
-        if leaving and late:
+        now = self.run.steady
+        leaving = [p for p in self.run.processes.values() if p.is_sink == self._sinks and p.reachable]
+        if self._has_run and self.failure is None and now > self._deadline - notice(self._time):
+            self._asking.ask(leaving, self._deadline)
+        if leaving and now > self._deadline:
             self._give_up_on(leaving)
-        given_up = self.run.steady > self._stage.deadline + DIE_WITHIN
-        if not self._stage.sinks and (not leaving or given_up):
+        if not self._sinks and (not leaving or now > self._deadline + DIE_WITHIN):
             if self.failure is not None:
                 self._hand_over()
-            self._stage = self._begin(sinks=True)
+            self._begin(sinks=True)
 
     @property
     def _has_run(self) -> bool:
         """Returns whether sources were released, so that there may be something to drain and to write."""
         return self.run.release is not None
 
-    def _leaving(self, *, sinks: bool) -> list[Supervised]:
-        return [p for p in self.run.processes.values() if p.is_sink == sinks and p.reachable]
+    @property
+    def _time(self) -> float:
+        """Returns the seconds that those which leave now may take for it."""
+        if not self._at_once and self.failure is None and self._has_run:
+            return bounded(self.run.plan.stall_timeout)
+        return (LEAVE_AT_ONCE if self._at_once else LEAVE_TIMEOUT) / (1 if self._sinks else 2)
 
-    def _time_for(self, *, sinks: bool) -> float:
-        if self._at_once:
-            return LEAVE_AT_ONCE if sinks else LEAVE_AT_ONCE / 2
-        if self.failure is not None or not self._has_run:
-            return LEAVE_TIMEOUT if sinks else LEAVE_TIMEOUT / 2
-        return bounded(self.run.plan.stall_timeout)
-
-    def _begin(self, *, sinks: bool) -> _Stage:
-        run = self.run
+    def _begin(self, *, sinks: bool) -> None:
+        """Asks the sinks, or all others, to leave."""
+        run, self._sinks = self.run, sinks
         outcome = self.outcome if self.failure is None else f"failed: {str(self.failure).splitlines()[0]}"
         for process in run.processes.values():
             if process.life is Life.AWAY:
                 process.take(Step.GIVE_UP, run.steady)
             elif process.is_sink == sinks and process.take(Step.LEAVE, run.steady):
-                if sinks:
-                    run.send(process, "leave", outcome=outcome, summaries=summaries_of(run))
-                else:
-                    run.send(process, "leave", outcome=outcome)
-        return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
+                more: dict[str, Any] = {"summaries": run.summaries()} if sinks else {}
+                run.send(process, "leave", outcome=outcome, **more)
+        self._deadline = run.steady + self._time
 
     def _give_up_on(self, late: list[Supervised]) -> None:
         names = "; ".join(p.describe() for p in late)
-        if self.failure is None and not self._has_run and not self._stage.sinks:
+        if self.failure is None and not self._has_run and not self._sinks:
             self.run.note(f"still starting, and killed: {names}")
         elif self.failure is None:
-            timeout = self._time_for(sinks=self._stage.sinks)
-            self.failure = RunFailed(f"did not close within {timeout:g} s: {names}", self.run.last_words(late))
+            self.failure = RunFailed(f"did not close within {self._time:g} s: {names}", self.run.last_words(late))
         for process in late:
             self.run.kill(process, process.cause or "was killed since it did not leave")

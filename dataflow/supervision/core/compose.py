@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataflow.supervision.configs import Config
 from dataflow.supervision.core.core import Core
 from dataflow.supervision.core.run_state import RunState
-from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.counts import Counts
 from dataflow.supervision.core.watchers.diagnostics import DiagnosticsWatcher
 from dataflow.supervision.core.watchers.drain_limit import DrainLimit
@@ -19,7 +18,6 @@ from dataflow.supervision.core.watchers.planned_faults import PlannedFaults
 from dataflow.supervision.core.watchers.quiescence import LOST_AFTER, Quiescence
 from dataflow.supervision.core.watchers.restarts import LiveRestarts, RestartPolicy
 from dataflow.supervision.core.watchers.stall import LiveStallWatch, StallWatch
-from dataflow.supervision.core.watchers.triggers import TriggersWatcher
 from dataflow.supervision.core.watchers.watcher import Watcher
 from dataflow.supervision.plan import ProcessPlan, RunPlan
 
@@ -33,33 +31,17 @@ def _lossless(run: RunState) -> Core:
     """Nothing may be lost: sources wait for all, and the first death ends the run."""
     quiescence = Quiescence(run)
     watch = StallWatch(run, quiescence)
-    parts = [Counts(run), LosslessCover(run), quiescence, watch, DrainLimit(run), TriggersWatcher(run)]
+    parts = [Counts(run), LosslessCover(run), quiescence, watch, DrainLimit(run)]
     return Core(run, parts, RestartPolicy(run))
 
 
 def _live(run: RunState) -> Core:
     """Time does not wait: what fails is started again by its policy, and the rest goes on."""
     parts: list[Watcher] = []
-
-    def tell(what: str, process: Supervised) -> None:
-        for part in parts:
-            if what == "away":
-                part.away(process)
-            else:
-                part.back(process)
-
-    remains = LeftoverRecords(run)
-    cover = LiveCover(run)
-    restarts = LiveRestarts(run, remains, tell)
-    quiescence = Quiescence(run, lost_after=LOST_AFTER)
+    remains, cover, quiescence = LeftoverRecords(run), LiveCover(run), Quiescence(run, lost_after=LOST_AFTER)
+    restarts = LiveRestarts(run, remains, parts)
     parts += [Counts(run), remains, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
     if run.plan.faults is not None:
         parts.append(PlannedFaults(run, run.plan.faults))
-    parts += [
-        DiagnosticsWatcher(run),
-        TriggersWatcher(run),
-        quiescence,
-        LiveStallWatch(run, quiescence),
-        DrainLimit(run),
-    ]
+    parts += [DiagnosticsWatcher(run), quiescence, LiveStallWatch(run, quiescence), DrainLimit(run)]
     return Core(run, parts, restarts)

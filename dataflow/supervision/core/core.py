@@ -10,39 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dataflow.supervision.core import events
 from dataflow.supervision.core.barrier import Barrier
 from dataflow.supervision.core.closing import LEAVE_TIMEOUT, Closing
 from dataflow.supervision.core.commands import Announce, Command, Over, Withdraw
-from dataflow.supervision.core.events import (
-    Aborted,
-    Begin,
-    ClockMeasured,
-    Died,
-    Event,
-    HungUp,
-    LeftBehind,
-    LinkChanged,
-    Moment,
-    NotReading,
-    Paused,
-    PlaybackAsked,
-    Printed,
-    Remained,
-    Said,
-    StopAsked,
-    Tick,
-    TriggerAsked,
-)
-from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step
+from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step, how_it_ended
 from dataflow.supervision.core.log_keeper import LogKeeper
-from dataflow.supervision.core.outcome import report_of
-from dataflow.supervision.core.report import RunFailed, Status
+from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.core.run_state import Phase, Release, RunState
 from dataflow.supervision.core.stack_traces import shortened
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.restarts import RestartPolicy
 from dataflow.supervision.core.watchers.watcher import Watcher
-from dataflow.supervision.core.wording import how_it_ended
+from dataflow.sync import FOREVER, NEVER
 
 
 class Core:
@@ -53,6 +33,7 @@ class Core:
         self._barrier = Barrier(run)
         self._logs = LogKeeper(run)
         self._closing: Closing | None = None
+        self._triggers: set[str] = set()
         self._stops = 0
         self._interrupted = False
         self._ended_at = 0.0
@@ -61,7 +42,7 @@ class Core:
     def status(self) -> Status:
         return self.run.status
 
-    def handle(self, event: Event, now: Moment) -> list[Command]:
+    def handle(self, event: events.Event, now: events.Moment) -> list[Command]:
         """Takes in what happened and returns what is to be done. Nothing happens any more after `Over`."""
         self.run.now = now
         if self.run.phase is not Phase.OVER:
@@ -73,53 +54,49 @@ class Core:
                 self._fail(failure)
         return self.run.take_commands()
 
-    def _handle(self, event: Event) -> None:
+    def _handle(self, event: events.Event) -> None:
+        run = self.run
         match event:
-            case Begin():
+            case events.Begin():
                 self._barrier.begin()
-            case Tick():
+            case events.Tick():
                 self._tick()
-            case Paused(seconds, uncounted):
-                if self.run.under_way:
-                    self.run.paused += uncounted
-                self.run.event(
-                    "paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process"
-                )
-            case StopAsked():
+            case events.Paused(seconds, uncounted):
+                run.paused += uncounted if run.under_way else 0.0
+                run.event("paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process")
+            case events.StopAsked():
                 self._stop()
-            case PlaybackAsked(action, steps, speed):
-                if self._closing is None and self.run.phase is not Phase.STARTING:
-                    self.run.send_all("playback", action=action, steps=steps, speed=speed)
-            case TriggerAsked(text):
-                if self._closing is None and self.run.phase is not Phase.STARTING:
-                    self.run.trigger(text)
-            case Aborted(why, interrupted):
+            case events.PlaybackAsked(action, steps, speed) if run.under_way:
+                run.send_all("playback", action=action, steps=steps, speed=speed)
+            case events.TriggerAsked(text) if run.under_way:
+                run.trigger(text)
+            case events.Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
-            case Said(label, kind, fields):
-                self._said(self.run.processes[label], kind, fields)
-            case Printed(label, line, log):
-                self.run.processes[label].words.append(line)
+            case events.Said(label, kind, fields):
+                self._said(run.processes[label], kind, fields)
+            case events.Printed(label, line, log):
+                run.processes[label].words.append(line)
                 if log is not None:
                     self._logs.take(log)
                     if self._closing is not None:
                         self._logs.hand_on_all()
-            case NotReading(label, seconds, _, overflowed):
+            case events.NotReading(label, seconds, _, overflowed):
                 for part in self._parts:
-                    part.not_reading(self.run.processes[label], seconds, overflowed=overflowed)
-            case HungUp(label):
-                self.run.processes[label].hung_up = self.run.steady
-            case LeftBehind(labels, processes):
+                    part.not_reading(run.processes[label], seconds, overflowed=overflowed)
+            case events.HungUp(label):
+                run.processes[label].hung_up = run.steady
+            case events.LeftBehind(labels, processes):
                 who = " or ".join(map(repr, labels))
-                self.run.note(f"process {who} left processes behind, which were killed: {', '.join(processes)}")
-            case Remained(label, remains):
+                run.note(f"process {who} left processes behind, which were killed: {', '.join(processes)}")
+            case events.Remained(label, remains):
                 for part in self._parts:
-                    part.remained(self.run.processes[label], remains)
-            case LinkChanged(machine, labels, up):
-                self.run.link_changed(machine, labels, up=up)
-            case ClockMeasured(machine, offset, delay):
-                self.run.clock_measured(machine, offset, delay)
-            case Died(label, code):
-                self._died(self.run.processes[label], code)
+                    part.remained(run.processes[label], remains)
+            case events.LinkChanged(machine, labels, up):
+                run.link_changed(machine, labels, up=up)
+            case events.ClockMeasured(machine, offset, delay):
+                run.clock_measured(machine, offset, delay)
+            case events.Died(label, code):
+                self._died(run.processes[label], code)
 
     # Time
 
@@ -127,9 +104,9 @@ class Core:
         self._logs.hand_on()
         for process in self.run.processes.values():
             self._see_to_death(process)
-        if self._closing is None and self.run.phase is Phase.STARTING:
+        if self.run.phase is Phase.STARTING:
             self._restarts.tick()
-        elif self._closing is None:
+        elif self.run.under_way:
             for part in self._parts:
                 part.tick()
         self._go_on()
@@ -201,6 +178,9 @@ class Core:
             case "closed":
                 if process.take(Step.CLOSE, now):
                     process.facts = fields["facts"]
+            case "trigger" if fields["id"] not in self._triggers:  # every process hands on what it is asked
+                self._triggers.add(fields["id"])
+                self.run.trigger(fields["text"])
             case "failed":
                 self._failed(process, fields)
                 return
@@ -254,24 +234,50 @@ class Core:
             for part in self._parts:
                 part.closing()
         run.command(Withdraw())
-        self._closing = Closing(
-            run,
-            outcome="interrupted" if self._interrupted else "complete",
-            failure=failure,
-            at_once=self._stops > 1,
-            hand_over=self._restarts.hand_over_all,
-        )
+        outcome, hand_over = "interrupted" if self._interrupted else "complete", self._restarts.hand_over_all
+        self._closing = Closing(run, outcome=outcome, failure=failure, at_once=self._stops > 1, hand_over=hand_over)
 
     def _over(self, closing: Closing) -> None:
         run = self.run
         run.enter(Phase.OVER)
-        report = None if closing.failure is not None else report_of(run, self._ended_at, interrupted=self._interrupted)
+        report = None if closing.failure is not None else _report_of(run, self._ended_at, self._interrupted)
         run.command(Over(report, closing.failure))
 
 
-def _decides(event: Event) -> bool:
+def _decides(event: events.Event) -> bool:
     """Returns whether a run may go on at once because of this event: a process has reached what others wait for."""
     match event:
-        case Said(_, "ready" | "seen" | "ended" | "closed", _) | Died():
+        case events.Said(_, "ready" | "seen" | "ended" | "closed", _) | events.Died():
             return True
     return False
+
+
+def _report_of(run: RunState, ended_at: float, interrupted: bool) -> RunReport:
+    """Returns the report of a run that has ended in order; `ended_at` is when everything was drained (steady s).
+
+    One that was interrupted while starting has done nothing, for 0 s.
+    """
+    status = run.status
+    reports = {p.label: p.report or {} for p in run.processes.values()}
+    streams = {s: (n, d) for r in reports.values() for s, (n, d) in r.get("streams", {}).items()}
+    reached = [c.done for c in status.operators.values() if c.done not in (NEVER, FOREVER)]
+    drops = {node: status.drops[node] for node in status.operators if status.drops.get(node)}
+    waits = {node: found for node, found in status.waits.items() if found}
+    return RunReport(
+        graph=run.graph.name,
+        streams=dict(sorted(streams.items())),
+        operators=dict(status.operators),
+        drops={node: tuple((i, why, n) for (i, why), n in sorted(found.items())) for node, found in drops.items()},
+        summaries=run.summaries(),
+        transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
+        files={p.label: p.facts for p in run.processes.values() if p.is_sink},
+        first=status.began if status.first is None else status.first,
+        last=max(reached, default=None),
+        wall=0.0 if run.release is None else ended_at - run.release.at.steady + run.paused,
+        interrupted=interrupted,
+        notes=tuple(status.notes),
+        sources=tuple(node.name for node in run.graph.sources() if node.name in status.operators),
+        restarts=dict(status.restarts),
+        waits={node: tuple((i, what, n) for (i, what), n in sorted(found.items())) for node, found in waits.items()},
+        namespace=run.graph.namespace,
+    )

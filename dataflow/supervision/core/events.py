@@ -1,4 +1,4 @@
-"""Events that the supervisor's core is told, each with the moment at which it happened."""
+"""Events that the supervisor's core takes, each with the moment at which it happened."""
 
 from __future__ import annotations
 
@@ -20,18 +20,24 @@ class Moment:
     wall: float
 
 
+class Event:
+    """Anything that happens to a run."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True)
-class Begin:
+class Begin(Event):
     """The run begins."""
 
 
 @dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Event):
     """Time has passed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Paused:
+class Paused(Event):
     """The supervisor did not run for so many seconds: it, or the whole machine, was stopped. `uncounted` are
     those of them that the steady clock has not counted."""
 
@@ -40,12 +46,12 @@ class Paused:
 
 
 @dataclass(frozen=True, slots=True)
-class StopAsked:
+class StopAsked(Event):
     """The user asks for an orderly end; a second time, for an end at once."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlaybackAsked:
+class PlaybackAsked(Event):
     """The user asks to pause, resume, step what is not live, or to change its speed."""
 
     action: Action
@@ -54,14 +60,14 @@ class PlaybackAsked:
 
 
 @dataclass(frozen=True, slots=True)
-class TriggerAsked:
+class TriggerAsked(Event):
     """The user asks the flight recorder to keep what was."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
-class Aborted:
+class Aborted(Event):
     """The program around the core cannot go on."""
 
     why: str
@@ -69,7 +75,7 @@ class Aborted:
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class Said(Event):
     """A process sent a message on its control channel."""
 
     label: str
@@ -78,7 +84,7 @@ class Said:
 
 
 @dataclass(frozen=True, slots=True)
-class Printed:
+class Printed(Event):
     """A process printed or logged something; `line` is how people are shown it."""
 
     label: str
@@ -88,7 +94,7 @@ class Printed:
 
 
 @dataclass(frozen=True, slots=True)
-class NotReading:
+class NotReading(Event):
     """A process has not taken what was sent to it for `seconds`. `overflowed`: some of it is lost."""
 
     label: str
@@ -98,14 +104,14 @@ class NotReading:
 
 
 @dataclass(frozen=True, slots=True)
-class HungUp:
+class HungUp(Event):
     """A process has closed its control channel."""
 
     label: str
 
 
 @dataclass(frozen=True, slots=True)
-class LeftBehind:
+class LeftBehind(Event):
     """A process that ended, or one of several that ended at once, has left others, which were killed: each as "name
     (process N)"."""
 
@@ -114,7 +120,7 @@ class LeftBehind:
 
 
 @dataclass(frozen=True, slots=True)
-class Remained:
+class Remained(Event):
     """A process has ended, and these are the firing records that it left. Comes just before its `Died`."""
 
     label: str
@@ -122,7 +128,7 @@ class Remained:
 
 
 @dataclass(frozen=True, slots=True)
-class Died:
+class Died(Event):
     """A process has ended. `code`: exit code, negative for a signal; None: unknown. Its last event."""
 
     label: str
@@ -130,7 +136,7 @@ class Died:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkChanged:
+class LinkChanged(Event):
     """The link to another machine, on which these processes run, went down or came up again."""
 
     machine: str
@@ -139,29 +145,9 @@ class LinkChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockMeasured:
+class ClockMeasured(Event):
     """The clock of another machine is ahead of this one's by `offset` ns, which is at most half of `delay` ns wrong."""
 
     machine: str
     offset: int
     delay: int
-
-
-Event = (
-    Begin
-    | Tick
-    | Paused
-    | StopAsked
-    | PlaybackAsked
-    | TriggerAsked
-    | Aborted
-    | Said
-    | Printed
-    | NotReading
-    | HungUp
-    | LeftBehind
-    | Remained
-    | Died
-    | LinkChanged
-    | ClockMeasured
-)

@@ -15,6 +15,7 @@ programs, and the news of a death may cross any message.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping
 from enum import Enum
 
@@ -81,3 +82,15 @@ HAS_PROCESS = frozenset(Life) - {Life.GONE, Life.AWAY}
 def after(state: Life, step: Step) -> Life | None:
     """Returns the state that a step leads to; None when the step is out of turn."""
     return TRANSITIONS[state].get(step)
+
+
+def how_it_ended(code: int | None) -> str:
+    """Returns the meaning of a process's exit code."""
+    if code is None:
+        return "ended in a way that is not known"
+    if code >= 0:
+        return f"exited with code {code}"
+    try:
+        return f"was killed by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was killed by signal {-code}"

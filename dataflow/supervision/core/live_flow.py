@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from dataflow.graph.model import Graph
+from dataflow.graph.reach import reached
 from dataflow.sync import NEVER
 
 
@@ -48,16 +49,9 @@ class LiveFlow:
 
 def sources_upstream(graph: Graph) -> dict[str, frozenset[str]]:
     """For each operator, the sources that it lives on, directly or through others; static streams do not count."""
-    found = {name: {name} if node.source else set() for name, node in graph.nodes.items()}
     makers = _makers(graph)
-    changed = True
-    while changed:
-        changed = False
-        for name, above in makers.items():
-            more = set().union(*(found[maker] for maker in above)) - found[name]
-            found[name] |= more
-            changed = changed or bool(more)
-    return {name: frozenset(sources) for name, sources in found.items()}
+    above = {name: {name} | reached([name], makers.__getitem__) for name in graph.nodes}
+    return {name: frozenset(each for each in found if graph.nodes[each].source) for name, found in above.items()}
 
 
 def waited_for(graph: Graph, processes: Iterable[Collection[str]]) -> frozenset[str]:
@@ -77,12 +71,5 @@ def waited_for(graph: Graph, processes: Iterable[Collection[str]]) -> frozenset[
 
 def _makers(graph: Graph) -> dict[str, set[str]]:
     """For each operator, those whose dynamic streams it takes."""
-    return {
-        name: {
-            graph.streams[stream].node
-            for streams in node.inputs.values()
-            for stream in streams
-            if not graph.streams[stream].static
-        }
-        for name, node in graph.nodes.items()
-    }
+    static = graph.static
+    return {name: {graph.streams[s].node for s in node.taken - static} for name, node in graph.nodes.items()}

@@ -4,11 +4,12 @@ given."""
 from __future__ import annotations
 
 import signal
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from dataflow.process.stacks import ASK
 from dataflow.supervision.core.commands import Command, Send, Signal, Spawn
 from dataflow.supervision.core.events import Moment
 from dataflow.supervision.core.life import WORKS, Life, Step
@@ -19,6 +20,8 @@ from dataflow.supervision.plan import ProcessPlan, RunPlan, taken_keys
 
 CLOCK_EVERY = 10.0
 """Seconds between two events that store the offset of a machine's clock."""
+ASK_BEFORE = 1.0
+"""Seconds before the time of a process is up at which it is asked where it is; of a short time, a fifth."""
 
 
 class Phase(Enum):
@@ -120,6 +123,11 @@ class RunState:
         lines = [f"[{p.label}] {line}" for p, line in said]
         return "\n".join(lines)
 
+    def summaries(self) -> dict[str, Mapping[str, Any]]:
+        """Returns what operators summed up at their end, as far as their processes have reported it."""
+        reports = [process.report or {} for process in self.processes.values()]
+        return {node: found for report in reports for node, found in report.get("summaries", {}).items()}
+
     # Acting
 
     def take_commands(self) -> list[Command]:
@@ -195,3 +203,24 @@ class RunState:
         """Shows a message to the user and stores it in the recording."""
         self.note(text)
         self.tell_recorder("event", name=name, stamp=self.event_time(), data={"text": text, **data})
+
+
+def notice(timeout: float) -> float:
+    """Returns how many seconds before the end of a time, which is so long, to ask."""
+    return min(ASK_BEFORE, timeout / 5)
+
+
+class Asking:
+    """Asks each process where it is, once for each time that it is stuck, before it is given up: what its threads are
+    at becomes part of its last words."""
+
+    def __init__(self, run: RunState) -> None:
+        self._run = run
+        self._asked: dict[str, object] = {}
+
+    def ask(self, late: Iterable[Supervised], since: object) -> None:
+        """Asks processes; `since` is something that changes when they go on."""
+        for process in late:
+            if self._asked.get(process.label) != since:
+                self._asked[process.label] = since
+                self._run.signal(process, ASK)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 
 from dataflow.messages import (
@@ -20,7 +21,6 @@ from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
-_FRUSTUM = (150, 155, 165)
 _DEPTH_COLORS = rr.components.Colormap.Turbo
 _FAR = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0)
 """Ends of the scale of depths, metres."""
@@ -33,17 +33,15 @@ def camera_info(canvas: Canvas, message: CameraInfo) -> None:
     """A frustum in the optical frame; images and overlays of this camera lie in its plane. Distortion is not shown."""
     canvas.scene.viewpoint.optical.setdefault(message.frame)
     canvas.scene.see(canvas.recording, message.frame, canvas.stamp)
-    canvas.log(
-        "",
-        rr.Pinhole(
-            image_from_camera=message.K,
-            resolution=[message.width, message.height],
-            parent_frame=message.frame,
-            child_frame=canvas.plane,
-            image_plane_distance=0.3,
-            color=_FRUSTUM,
-        ),
+    pinhole = rr.Pinhole(
+        image_from_camera=message.K,
+        resolution=[message.width, message.height],
+        parent_frame=message.frame,
+        child_frame=canvas.plane,
+        image_plane_distance=0.3,
+        color=colors.NEUTRAL,
     )
+    canvas.log("", pinhole)
 
 
 @visualizer(Image, "image")
@@ -52,15 +50,16 @@ def image(canvas: Canvas, message: Image) -> None:
     if message.data.size == 0:
         canvas.clear("")
         return
-    picture = rr.Image(  # not from the array itself: of that, Rerun drops extents of 1
-        bytes=message.data.tobytes(),
-        width=message.width,
-        height=message.height,
-        color_model="RGB" if message.is_color else "L",
-        datatype="U8",
-    )
+    picture = _picture(message.data)
     quality = canvas.scene.options.jpeg_quality
     canvas.draw("", canvas.plane, picture if quality is None else picture.compress(jpeg_quality=quality))
+
+
+def _picture(pixels: npt.NDArray[np.uint8]) -> rr.Image:
+    """Pixels (H, W, 3) or (H, W); not from the array itself: of that, Rerun drops extents of 1."""
+    height, width, *colored = pixels.shape
+    model = rr.ColorModel.RGB if colored else rr.ColorModel.L
+    return rr.Image(bytes=pixels.tobytes(), width=width, height=height, color_model=model, datatype="U8")
 
 
 @visualizer(Image16, "image")
@@ -74,9 +73,8 @@ def image16(canvas: Canvas, message: Image16) -> None:
 @visualizer(CompressedImage, "image")
 def compressed_image(canvas: Canvas, message: CompressedImage) -> None:
     """The encoded file as it is."""
-    canvas.draw(
-        "", canvas.plane, rr.EncodedImage(contents=message.data.tobytes(), media_type=f"image/{message.format}")
-    )
+    encoded = rr.EncodedImage(contents=message.data.tobytes(), media_type=f"image/{message.format}")
+    canvas.draw("", canvas.plane, encoded)
 
 
 @visualizer(CompressedVideo, "image")
@@ -104,14 +102,9 @@ def depth_image(canvas: Canvas, message: DepthImage) -> None:
 @visualizer(CompressedDepth, "image")
 def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
     """As a depth image; a PNG of values proportional to depth and no finer than asked for is passed on as it is."""
-    step = canvas.scene.options.depth_step
-    proportional = message.quantizer == "linear" and message.offset == 0.0
-    if (
-        proportional
-        and canvas.scene.options.depth_block == 1
-        and (step is None or message.scale > step / 2)
-        and (canvas.entity, "depth scale") in canvas.scene.remembered
-    ):
+    step, linear = canvas.scene.options.depth_step, message.quantizer == "linear"
+    fits = canvas.scene.options.depth_block == 1 and (step is None or message.scale > step / 2)
+    if linear and message.offset == 0.0 and fits and (canvas.entity, "depth scale") in canvas.scene.remembered:
         _encoded_depth(canvas, message.data.tobytes(), 1.0 / message.scale)
         return
     values = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
@@ -119,11 +112,7 @@ def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
         raise ValueError("the PNG of the CompressedDepth cannot be decoded")
     pixels = values.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (
-            message.scale * pixels + message.offset
-            if message.quantizer == "linear"
-            else message.scale / (pixels - message.offset)
-        )
+        depth = message.scale * pixels + message.offset if linear else message.scale / (pixels - message.offset)
     _depth(canvas, np.where(pixels > 0, depth, 0.0).astype(np.float32))
 
 
@@ -134,15 +123,11 @@ def relative_depth(canvas: Canvas, message: RelativeDepth) -> None:
     values = message.data[known]
     low, high = np.percentile(values, (1, 99)) if values.size else (0.0, 1.0)
     share = np.clip((np.where(known, message.data, low) - low) / max(float(high - low), 1e-9), 0, 1)
-    colors = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
-    colors = np.where(known[..., None], colors, 0).astype(np.uint8)
-    picture = rr.Image(
-        bytes=colors.tobytes(), width=message.width, height=message.height, color_model="RGB", datatype="U8"
-    )
-    canvas.draw("", canvas.plane, picture)
+    colored = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    canvas.draw("", canvas.plane, _picture(np.where(known[..., None], colored, 0).astype(np.uint8)))
 
 
-def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
+def _depth(canvas: Canvas, depth: npt.NDArray[np.float32]) -> None:
     if depth.size == 0:
         canvas.clear("")
         return
@@ -167,7 +152,7 @@ def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
     _encoded_depth(canvas, png.tobytes(), units)
 
 
-def _in_blocks(steps: np.typing.NDArray[np.uint16], side: int) -> np.typing.NDArray[np.uint16]:
+def _in_blocks(steps: npt.NDArray[np.uint16], side: int) -> npt.NDArray[np.uint16]:
     """The image in squares that have the value of their first pixel: as large as before, and far easier to pack."""
     if side == 1:
         return steps
@@ -177,17 +162,11 @@ def _in_blocks(steps: np.typing.NDArray[np.uint16], side: int) -> np.typing.NDAr
 def _encoded_depth(canvas: Canvas, png: bytes, units: float) -> None:
     """A depth PNG with `units` steps per metre, in colours that mean the same from the first image to the last."""
     far = canvas.scene.remembered.get((canvas.entity, "depth scale"))
-    canvas.draw(
-        "",
-        canvas.plane,
-        rr.EncodedDepthImage(
-            blob=png,
-            media_type="image/png",
-            meter=units,
-            colormap=_DEPTH_COLORS,
-            depth_range=None if far is None else (0.0, far * units),
-        ),
+    span = None if far is None else (0.0, far * units)
+    picture = rr.EncodedDepthImage(
+        blob=png, media_type="image/png", meter=units, colormap=_DEPTH_COLORS, depth_range=span
     )
+    canvas.draw("", canvas.plane, picture)
 
 
 def _scale(canvas: Canvas, far: float, shape: tuple[int, ...]) -> None:
@@ -198,29 +177,20 @@ def _scale(canvas: Canvas, far: float, shape: tuple[int, ...]) -> None:
     top, bottom, side = 0.08 * height, 0.92 * height, max(width / 40, 3.0)
     cuts = np.linspace(bottom, top, _SHADES + 1)
     column = np.full(_SHADES, 1.5 * side)
-    canvas.log(
-        "scale/bar",
-        rr.CoordinateFrame(canvas.plane),
-        rr.LineStrips2D(
-            np.stack([np.column_stack([column, cuts[:-1]]), np.column_stack([column, cuts[1:]])], axis=1),
-            colors=colors.of_values(np.arange(_SHADES), 0.0, _SHADES - 1.0),
-            radii=side / 2,
-            draw_order=5.0,
-        ),
-        static=True,
+    bar = rr.LineStrips2D(
+        np.stack([np.column_stack([column, cuts[:-1]]), np.column_stack([column, cuts[1:]])], axis=1),
+        colors=colors.of_values(np.arange(_SHADES), 0.0, _SHADES - 1.0),
+        radii=side / 2,
+        draw_order=5.0,
     )
+    canvas.log("scale/bar", rr.CoordinateFrame(canvas.plane), bar, static=True)
     marks = np.linspace(0.0, end, 5)
-    rows = bottom - marks / end * (bottom - top)
-    canvas.log(
-        "scale/marks",
-        rr.CoordinateFrame(canvas.plane),
-        rr.Points2D(
-            np.column_stack([np.full(5, 2.0 * side), rows]),
-            colors=(235, 235, 235),
-            radii=rr.Radius.ui_points(1.5),
-            labels=[f"{mark:g} m" for mark in marks],
-            show_labels=True,
-            draw_order=6.0,
-        ),
-        static=True,
+    points = rr.Points2D(
+        np.column_stack([np.full(5, 2.0 * side), bottom - marks / end * (bottom - top)]),
+        colors=(235, 235, 235),
+        radii=rr.Radius.ui_points(1.5),
+        labels=[f"{mark:g} m" for mark in marks],
+        show_labels=True,
+        draw_order=6.0,
     )
+    canvas.log("scale/marks", rr.CoordinateFrame(canvas.plane), points, static=True)

@@ -1,4 +1,4 @@
-"""Point clouds and clusters."""
+"""Point clouds, clusters, planar lidar and radar."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from dataflow.messages import Clusters, PointCloud
+from dataflow.messages import Clusters, LaserScan, PointCloud, RadarScan
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.scene import TIMELINE
@@ -25,6 +25,8 @@ _WAITING = 16
 _BITS = 21  # of a coordinate of a cell
 _FARTHEST = 1e30  # metres
 _KEPT_AT_ONCE = 6_000  # points of one cloud that are looked at for cells: more clouds will come
+_SCAN = (255, 90, 90)
+_FASTEST = 10.0  # m/s: the end of the scale of radial velocities
 
 
 @dataclass(slots=True)
@@ -124,33 +126,51 @@ def clusters(canvas: Canvas, message: Clusters) -> None:
     """A box around each cluster, or a point at its centroid where it has no bounds."""
     names = range(message.count) if message.ids is None else message.ids.tolist()
     paint = colors.of_identities(list(names))
-    labels = [str(name) for name in names]
+    drawn: rr.Boxes3D | rr.Points3D
     if message.lower is not None and message.upper is not None:
         shown = finite_rows(message.lower, message.upper)
-        canvas.draw(
-            "space",
-            message.frame,
-            rr.Boxes3D(
-                centers=((message.lower + message.upper) / 2)[shown],
-                half_sizes=((message.upper - message.lower) / 2)[shown],
-                colors=paint[shown],
-                labels=[labels[i] for i in shown],
-                show_labels=True,
-            ),
+        drawn = rr.Boxes3D(
+            centers=((message.lower + message.upper) / 2)[shown],
+            half_sizes=((message.upper - message.lower) / 2)[shown],
+            colors=paint[shown],
+            labels=[str(names[i]) for i in shown],
+            show_labels=True,
         )
-        return
-    shown = finite_rows(message.centroids)
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Points3D(
+    else:
+        shown = finite_rows(message.centroids)
+        drawn = rr.Points3D(
             message.centroids[shown],
             colors=paint[shown],
-            labels=[labels[i] for i in shown],
+            labels=[str(names[i]) for i in shown],
             radii=rr.Radius.ui_points(5.0),
             show_labels=True,
-        ),
-    )
+        )
+    canvas.draw("space", message.frame, drawn)
+
+
+@visualizer(LaserScan, "space")
+def laser_scan(canvas: Canvas, message: LaserScan) -> None:
+    """A point where each beam ended."""
+    points = message.points()
+    canvas.scene.viewpoint.saw_range(np.linalg.norm(points, axis=1))
+    canvas.draw("space", message.frame, rr.Points3D(points, colors=_SCAN, radii=rr.Radius.ui_points(2.5)))
+
+
+@visualizer(RadarScan, "space")
+def radar_scan(canvas: Canvas, message: RadarScan) -> None:
+    """Points with arrows along the radial velocity (one second), blue when approaching, red when receding."""
+    points = message.points()
+    shown = finite_rows(points)
+    points = points[shown]
+    canvas.scene.viewpoint.saw_range(np.linalg.norm(points, axis=1))
+    speeds = None if message.velocities is None else message.velocities[shown].astype(np.float64)
+    paint = _SCAN if speeds is None else colors.of_values(speeds, -_FASTEST, _FASTEST)
+    canvas.draw("space", message.frame, rr.Points3D(points, colors=paint, radii=rr.Radius.ui_points(4.0)))
+    if speeds is not None:
+        away = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+        moved = away * np.clip(np.nan_to_num(speeds), -1e3, 1e3)[:, None]
+        arrows = rr.Arrows3D(origins=points, vectors=moved, colors=paint, radii=rr.Radius.ui_points(1.0))
+        canvas.draw("space/velocity", message.frame, arrows)
 
 
 def finite_rows(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.int64]:

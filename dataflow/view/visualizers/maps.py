@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 
 from dataflow.messages import Mesh, OccupancyGrid, Planes, Rooms
@@ -26,19 +27,16 @@ def occupancy_grid(canvas: Canvas, message: OccupancyGrid) -> None:
         canvas.clear("space")
         return
     image = message.cells[::-1].view(np.uint8)  # an image's first row is the top one; the grid's lies at the origin
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.GridMap(
-            data=image.tobytes(),
-            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
-            cell_size=message.resolution,
-            translation=message.position,
-            quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
-            colormap=rr.components.Colormap.RvizMap,
-            opacity=0.45,
-        ),
+    grid = rr.GridMap(
+        data=image.tobytes(),
+        format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+        cell_size=message.resolution,
+        translation=message.position,
+        quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
+        colormap=rr.components.Colormap.RvizMap,
+        opacity=0.45,
     )
+    canvas.draw("space", message.frame, grid)
 
 
 @visualizer(Rooms, "space")
@@ -50,30 +48,24 @@ def rooms(canvas: Canvas, message: Rooms) -> None:
         return
     corners, own = _runs(message.cells)
     flat = np.column_stack([corners * message.resolution, np.full(len(corners), _LIFT)])
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Mesh3D(
-            vertex_positions=transform_points(message.matrix(), flat),
-            triangle_indices=(np.arange(0, len(corners), 4)[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3),
-            vertex_colors=np.repeat(colors.of_identities(message.ids[own].tolist()), 4, axis=0),
-            albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
-        ),
+    floors = rr.Mesh3D(
+        vertex_positions=transform_points(message.matrix(), flat),
+        triangle_indices=(np.arange(0, len(corners), 4)[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3),
+        vertex_colors=np.repeat(colors.of_identities(message.ids[own].tolist()), 4, axis=0),
+        albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
     )
+    canvas.draw("space", message.frame, floors)
     names = [f"room {i}: {area:.1f} m²" for i, area in zip(message.ids.tolist(), message.areas.tolist(), strict=True)]
     doors = [f"door {width:.2f} m" for width in message.door_widths.tolist()]
     paint = np.concatenate([colors.of_identities(message.ids.tolist()), np.tile(_DOOR, (len(doors), 1))])
-    canvas.draw(
-        "space/places",
-        message.frame,
-        rr.Points3D(
-            np.concatenate([message.centers, message.door_positions]),
-            colors=paint.astype(np.uint8),
-            labels=[*names, *doors],
-            radii=rr.Radius.ui_points(3.0),
-            show_labels=True,
-        ),
+    places = rr.Points3D(
+        np.concatenate([message.centers, message.door_positions]),
+        colors=paint.astype(np.uint8),
+        labels=[*names, *doors],
+        radii=rr.Radius.ui_points(3.0),
+        show_labels=True,
     )
+    canvas.draw("space/places", message.frame, places)
 
 
 @visualizer(Mesh, "space")
@@ -84,17 +76,14 @@ def mesh(canvas: Canvas, message: Mesh) -> None:
     if not len(triangles):
         canvas.clear("space")
         return
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Mesh3D(
-            vertex_positions=np.nan_to_num(message.vertices),
-            triangle_indices=triangles,
-            vertex_normals=None if message.normals is None else np.nan_to_num(message.normals),
-            vertex_colors=message.colors,
-            albedo_factor=None if message.colors is not None else (*colors.NEUTRAL, 255),
-        ),
+    drawn = rr.Mesh3D(
+        vertex_positions=np.nan_to_num(message.vertices),
+        triangle_indices=triangles,
+        vertex_normals=None if message.normals is None else np.nan_to_num(message.normals),
+        vertex_colors=message.colors,
+        albedo_factor=None if message.colors is not None else (*colors.NEUTRAL, 255),
     )
+    canvas.draw("space", message.frame, drawn)
 
 
 @visualizer(Planes, "space")
@@ -113,26 +102,19 @@ def planes(canvas: Canvas, message: Planes) -> None:
     if message.hulls is not None:
         _hulls(canvas, message, paint)
     else:
-        half = np.column_stack([extents / 2, np.full(len(shown), 0.002)])
-        canvas.draw(
-            "space",
-            message.frame,
-            rr.Boxes3D(
-                centers=centers,
-                half_sizes=half,
-                quaternions=turned,
-                colors=np.column_stack([paint[shown], np.full(len(shown), _SHEER, np.uint8)]),
-                fill_mode=rr.components.FillMode.Solid,
-            ),
+        sheets = rr.Boxes3D(
+            centers=centers,
+            half_sizes=np.column_stack([extents / 2, np.full(len(shown), 0.002)]),
+            quaternions=turned,
+            colors=np.column_stack([paint[shown], np.full(len(shown), _SHEER, np.uint8)]),
+            fill_mode=rr.components.FillMode.Solid,
         )
-    canvas.draw(
-        "space/normals",
-        message.frame,
-        rr.Arrows3D(origins=centers, vectors=normals[shown] * _NORMAL, colors=paint[shown]),
-    )
+        canvas.draw("space", message.frame, sheets)
+    arrows = rr.Arrows3D(origins=centers, vectors=normals[shown] * _NORMAL, colors=paint[shown])
+    canvas.draw("space/normals", message.frame, arrows)
 
 
-def _runs(cells: np.typing.NDArray[np.int32]) -> tuple[np.typing.NDArray[np.float64], np.typing.NDArray[np.intp]]:
+def _runs(cells: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
     """Returns the rectangles of cells of one room that lie side by side in a row: corners (4 N, 2), x and y in cells,
     and the room (N,) of each."""
     edges = np.diff(np.pad(cells, ((0, 0), (1, 1)), constant_values=-1), axis=1) != 0
@@ -143,7 +125,7 @@ def _runs(cells: np.typing.NDArray[np.int32]) -> tuple[np.typing.NDArray[np.floa
     return np.stack(around, axis=1).reshape(-1, 2).astype(np.float64), cells[rows, begins].astype(np.intp)
 
 
-def _hulls(canvas: Canvas, message: Planes, paint: np.typing.NDArray[np.uint8]) -> None:
+def _hulls(canvas: Canvas, message: Planes, paint: npt.NDArray[np.uint8]) -> None:
     """Draws the hulls as sheets of triangles around their first corner, and their edges."""
     hulls = [message.hull(k) for k in range(message.count)]
     drawn = [k for k, hull in enumerate(hulls) if len(hull) > 2 and np.isfinite(hull).all()]
@@ -154,21 +136,18 @@ def _hulls(canvas: Canvas, message: Planes, paint: np.typing.NDArray[np.uint8]) 
     sizes = np.array([len(hulls[k]) for k in drawn])
     starts = np.cumsum(sizes) - sizes
     fans = [start + np.array([[0, i, i + 1] for i in range(1, n - 1)]) for start, n in zip(starts, sizes, strict=True)]
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Mesh3D(
-            vertex_positions=np.concatenate([hulls[k] for k in drawn]),
-            triangle_indices=np.concatenate(fans),
-            vertex_colors=np.repeat(paint[drawn], sizes, axis=0),
-            albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
-        ),
+    sheets = rr.Mesh3D(
+        vertex_positions=np.concatenate([hulls[k] for k in drawn]),
+        triangle_indices=np.concatenate(fans),
+        vertex_colors=np.repeat(paint[drawn], sizes, axis=0),
+        albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
     )
+    canvas.draw("space", message.frame, sheets)
     edges = [np.vstack([hulls[k], hulls[k][:1]]) for k in drawn]
     canvas.draw("space/edges", message.frame, rr.LineStrips3D(edges, colors=paint[drawn]))
 
 
-def _basis(normal: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+def _basis(normal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """A rotation (3, 3) whose z axis is `normal`."""
     helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
     x = np.cross(helper, normal)

@@ -34,8 +34,8 @@ def detections_2d(canvas: Canvas, message: Detections2D) -> None:
     shown = finite_rows(message.boxes)
     names = message.labels()
     _masks(canvas, message, names)
-    labels = [_label(names[i], _id(message.ids, i), float(message.scores[i])) for i in shown]
-    _boxes_2d(canvas, message.boxes[shown], colors.of_classes([names[i] for i in shown]), labels)
+    paint = colors.of_classes([names[i] for i in shown])
+    _boxes_2d(canvas, message.boxes[shown], paint, [_scored(message, names, i) for i in shown])
 
 
 def _masks(canvas: Canvas, message: Detections2D, names: Sequence[str]) -> None:
@@ -88,18 +88,15 @@ def boxes_3d(canvas: Canvas, message: Boxes3D) -> None:
     shown = finite_rows(message.centers, message.sizes, message.orientations)
     names = message.labels()
     paint = colors.of_classes([names[i] for i in shown])
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Boxes3D(
-            centers=message.centers[shown],
-            half_sizes=message.sizes[shown] / 2,
-            quaternions=message.orientations[shown],
-            colors=paint,
-            labels=[_label(names[i], _id(message.ids, i), float(message.scores[i])) for i in shown],
-            show_labels=len(shown) <= MANY_LABELS,
-        ),
+    boxes = rr.Boxes3D(
+        centers=message.centers[shown],
+        half_sizes=message.sizes[shown] / 2,
+        quaternions=message.orientations[shown],
+        colors=paint,
+        labels=[_scored(message, names, i) for i in shown],
+        show_labels=len(shown) <= MANY_LABELS,
     )
+    canvas.draw("space", message.frame, boxes)
     _velocities(canvas, message.frame, message.centers[shown], message.velocities, shown, paint)
 
 
@@ -111,7 +108,7 @@ def tracks(canvas: Canvas, message: Tracks) -> None:
     """
     alive = np.flatnonzero(message.states != TrackState.ENDED)
     names = message.labels()
-    labels = [_label(names[i], int(message.ids[i]), None) for i in range(message.count)]
+    labels = [f"{names[i]} #{message.ids[i]}" for i in range(message.count)]
     paint = colors.of_identities(message.ids.tolist())
     paint[message.states == TrackState.COASTING] //= 2
     if message.boxes is not None:
@@ -121,32 +118,18 @@ def tracks(canvas: Canvas, message: Tracks) -> None:
         return
     shown = alive[np.isin(alive, finite_rows(message.positions))]
     centers = message.positions[shown]
-    names_shown = [labels[i] for i in shown]
     if message.sizes is not None:
-        canvas.draw(
-            "space",
-            message.frame,
-            rr.Boxes3D(
-                centers=centers,
-                half_sizes=np.nan_to_num(message.sizes[shown]) / 2,
-                quaternions=None if message.orientations is None else message.orientations[shown],
-                colors=paint[shown],
-                labels=names_shown,
-                show_labels=len(shown) <= MANY_LABELS,
-            ),
+        boxes = rr.Boxes3D(
+            centers=centers,
+            half_sizes=np.nan_to_num(message.sizes[shown]) / 2,
+            quaternions=None if message.orientations is None else message.orientations[shown],
+            colors=paint[shown],
+            labels=[labels[i] for i in shown],
+            show_labels=len(shown) <= MANY_LABELS,
         )
+        canvas.draw("space", message.frame, boxes)
     else:
-        canvas.draw(
-            "space",
-            message.frame,
-            rr.Points3D(
-                centers,
-                colors=paint[shown],
-                labels=names_shown,
-                radii=rr.Radius.ui_points(6.0),
-                show_labels=len(shown) <= MANY_LABELS,
-            ),
-        )
+        _points_3d(canvas, message.frame, centers, paint[shown], [labels[i] for i in shown])
     _velocities(canvas, message.frame, centers, message.velocities, shown, paint[shown])
     _track_paths(canvas, message, shown, paint)
 
@@ -159,61 +142,48 @@ def landmark_sightings(canvas: Canvas, message: LandmarkSightings) -> None:
     points, ranges, bearings = message.positions, message.ranges, message.bearings
     if points is not None and points.shape[1] == 2:
         points = np.column_stack([points, np.zeros(len(points))])
+    strips: list[npt.NDArray[np.float64]] = []
     if points is None and bearings is not None:
         e = np.zeros(message.count) if message.elevations is None else message.elevations
         rays = np.column_stack([np.cos(e) * np.cos(bearings), np.cos(e) * np.sin(bearings), np.sin(e)])
         if ranges is None:
             shown = finite_rows(rays)
             strips = [np.array([np.zeros(3), rays[i] * _RAY]) for i in shown]
-            canvas.draw(
-                "space",
-                message.frame,
-                rr.LineStrips3D(strips, colors=paint[shown], labels=[labels[i] for i in shown]),
-            )
-            return
-        with np.errstate(invalid="ignore", over="ignore"):
-            points = rays * ranges[:, None]
-    if points is None:
+        else:
+            with np.errstate(invalid="ignore", over="ignore"):
+                points = rays * ranges[:, None]
+    elif points is None:
         assert ranges is not None  # polar without bearings
         turn = np.linspace(0, 2 * np.pi, 65)
         circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
         shown = finite_rows(ranges)
-        canvas.draw(
-            "space",
-            message.frame,
-            rr.LineStrips3D(
-                [circle * ranges[i] for i in shown], colors=paint[shown], labels=[labels[i] for i in shown]
-            ),
-        )
+        strips = [circle * ranges[i] for i in shown]
+    if points is None:
+        lines = rr.LineStrips3D(strips, colors=paint[shown], labels=[labels[i] for i in shown])
+        canvas.draw("space", message.frame, lines)
         return
     shown = finite_rows(points)
     canvas.scene.viewpoint.saw_places(canvas.scene.tree.pose(message.frame), points[shown])
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Points3D(
-            points[shown],
-            colors=paint[shown],
-            labels=[labels[i] for i in shown],
-            radii=rr.Radius.ui_points(6.0),
-            show_labels=len(shown) <= MANY_LABELS,
-        ),
-    )
+    _points_3d(canvas, message.frame, points[shown], paint[shown], [labels[i] for i in shown])
+
+
+def _points_3d(
+    canvas: Canvas, frame: str, points: npt.NDArray[np.float64], paint: colors.Colors, labels: list[str]
+) -> None:
+    radius, few = rr.Radius.ui_points(6.0), len(labels) <= MANY_LABELS
+    canvas.draw("space", frame, rr.Points3D(points, colors=paint, labels=labels, radii=radius, show_labels=few))
 
 
 def _boxes_2d(canvas: Canvas, boxes: npt.NDArray[np.float32], paint: colors.Colors, labels: list[str]) -> None:
-    canvas.draw(
-        "overlay",
-        canvas.plane,
-        rr.Boxes2D(
-            array=boxes.reshape(-1, 4),
-            array_format=rr.Box2DFormat.XYXY,
-            colors=paint,
-            labels=labels,
-            show_labels=len(labels) <= MANY_LABELS,
-            draw_order=10.0,
-        ),
+    drawn = rr.Boxes2D(
+        array=boxes.reshape(-1, 4),
+        array_format=rr.Box2DFormat.XYXY,
+        colors=paint,
+        labels=labels,
+        show_labels=len(labels) <= MANY_LABELS,
+        draw_order=10.0,
     )
+    canvas.draw("overlay", canvas.plane, drawn)
 
 
 def _velocities(
@@ -228,16 +198,9 @@ def _velocities(
         return
     vectors = velocities[shown]
     moving = (np.abs(vectors) < 1e4).all(axis=1) & (np.abs(vectors) > _STILL).any(axis=1)
-    canvas.draw(
-        "space/velocity",
-        frame,
-        rr.Arrows3D(
-            vectors=vectors[moving],
-            origins=origins[moving],
-            colors=paint[moving],
-            radii=rr.Radius.ui_points(1.5),
-        ),
-    )
+    radius = rr.Radius.ui_points(1.5)
+    arrows = rr.Arrows3D(vectors=vectors[moving], origins=origins[moving], colors=paint[moving], radii=radius)
+    canvas.draw("space/velocity", frame, arrows)
 
 
 def _track_paths(canvas: Canvas, message: Tracks, shown: npt.NDArray[np.int64], paint: colors.Colors) -> None:
@@ -255,24 +218,13 @@ def _track_paths(canvas: Canvas, message: Tracks, shown: npt.NDArray[np.int64], 
         if not path:
             del paths[identity]
     drawn = [(i, paths[int(message.ids[i])]) for i in shown if len(paths.get(int(message.ids[i]), ())) > 1]
-    canvas.draw(
-        "space/paths",
-        message.frame,
-        rr.LineStrips3D(
-            [np.array([position for _, position in path]) for _, path in drawn],
-            colors=[paint[i] for i, _ in drawn],
-            radii=rr.Radius.ui_points(1.5),
-        ),
-    )
+    strips = [np.array([position for _, position in path]) for _, path in drawn]
+    lines = rr.LineStrips3D(strips, colors=[paint[i] for i, _ in drawn], radii=rr.Radius.ui_points(1.5))
+    canvas.draw("space/paths", message.frame, lines)
 
 
-def _id(ids: Sequence[int] | npt.NDArray[np.int64] | None, index: int) -> int | None:
-    return None if ids is None else int(ids[index])
-
-
-def _label(name: str, identity: int | None, score: float | None) -> str:
-    """Such as "chair #3 0.87"; a score of 1 (truth, or an unscored box) is left out."""
-    words = [name] + ([f"#{identity}"] if identity is not None else [])
-    if score is not None and np.isfinite(score) and score != 1:
-        words.append(f"{score:.2f}")
-    return " ".join(words)
+def _scored(message: Detections2D | Boxes3D, names: Sequence[str], index: int) -> str:
+    """A label such as "chair #3 0.87"; a score of 1 (truth, or an unscored box) is left out."""
+    identity = "" if message.ids is None else f" #{message.ids[index]}"
+    score = float(message.scores[index])
+    return names[index] + identity + (f" {score:.2f}" if np.isfinite(score) and score != 1 else "")

@@ -13,6 +13,8 @@ from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.scene import Trail
 from dataflow.view.visualizers.clouds import finite_rows, thin
 
+F64 = npt.NDArray[np.float64]
+
 _AXIS = 0.15  # metres
 _ARROW = 0.12  # metres: a particle
 _NAMES = 0.3  # metres: from a pose to its name, and from there to the next
@@ -37,11 +39,8 @@ def point(canvas: Canvas, message: Point) -> None:
         canvas.clear("space/covariance")
         return
     name = "/".join(canvas.stream.split("/")[-2:])
-    canvas.draw(
-        "space/point",
-        message.frame,
-        rr.Points3D([message.position], radii=rr.Radius.ui_points(5.0), labels=[name], show_labels=True),
-    )
+    dot = rr.Points3D([message.position], radii=rr.Radius.ui_points(5.0), labels=[name], show_labels=True)
+    canvas.draw("space/point", message.frame, dot)
     if message.covariance is not None:
         _ellipsoid(canvas, message.frame, message.position, message.covariance)
 
@@ -96,16 +95,9 @@ def particle_set(canvas: Canvas, message: ParticleSet) -> None:
     else:
         positions, rotations = poses[:, :3], poses[:, 3:]
     ahead = quaternion_to_matrix(rotations)[..., 0] if len(poses) else np.zeros((0, 3))
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Arrows3D(
-            origins=positions,
-            vectors=ahead * _ARROW,
-            colors=colors.of_values(message.weights[kept]),
-            radii=rr.Radius.ui_points(1.0),
-        ),
-    )
+    paint = colors.of_values(message.weights[kept])
+    arrows = rr.Arrows3D(origins=positions, vectors=ahead * _ARROW, colors=paint, radii=rr.Radius.ui_points(1.0))
+    canvas.draw("space", message.frame, arrows)
 
 
 @visualizer(NavSatFix, "map", "plot")
@@ -125,16 +117,10 @@ def nav_sat_fix(canvas: Canvas, message: NavSatFix) -> None:
     canvas.scene.trails[canvas.entity] = Trail("", here)
 
 
-def _moving(
-    canvas: Canvas,
-    frame: str,
-    T_frame_child: npt.NDArray[np.float64],
-    covariance: npt.NDArray[np.float64] | None,
-) -> None:
+def _moving(canvas: Canvas, frame: str, T_frame_child: F64, covariance: F64 | None) -> None:
     if not np.isfinite(T_frame_child).all():
-        canvas.clear("space/axes")
-        canvas.clear("space/covariance")
-        canvas.clear("space/name")
+        for path in ("space/axes", "space/covariance", "space/name"):
+            canvas.clear(path)
         canvas.scene.trails.pop(canvas.entity, None)
         canvas.scene.remembered.pop((canvas.entity, "pose"), None)
         return
@@ -148,24 +134,21 @@ def _moving(
     _name(canvas, frame, position)
 
 
-def _name(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> None:
+def _name(canvas: Canvas, frame: str, position: F64) -> None:
     """The stream's name in the colour of its trail, above the pose; names of several streams one above the other."""
     rivals = canvas.scene.layout.of_type(Pose, Odometry)
     height = _NAMES * (1 + rivals.index(canvas.stream)) if canvas.stream in rivals else _NAMES
-    canvas.draw(
-        "space/name",
-        frame,
-        rr.Points3D(
-            [position + np.array([0.0, 0.0, height])],
-            colors=canvas.scene.trail_color(canvas.stream, rivals),
-            radii=rr.Radius.ui_points(1.0),
-            labels=["/".join(canvas.stream.split("/")[-2:])],
-            show_labels=True,
-        ),
+    name = rr.Points3D(
+        [position + np.array([0.0, 0.0, height])],
+        colors=canvas.scene.trail_color(canvas.stream, rivals),
+        radii=rr.Radius.ui_points(1.0),
+        labels=["/".join(canvas.stream.split("/")[-2:])],
+        show_labels=True,
     )
+    canvas.draw("space/name", frame, name)
 
 
-def _trail(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> None:
+def _trail(canvas: Canvas, frame: str, position: F64) -> None:
     """One segment, from the last vertex to here: the view shows all of them, so a trail costs the same for ever."""
     last = canvas.scene.trails.get(canvas.entity)
     if last is None or last.frame != frame:
@@ -177,15 +160,12 @@ def _trail(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> Non
     canvas.scene.viewpoint.saw_places(canvas.scene.tree.pose(frame), position)
     if step <= _GAP:
         color = canvas.scene.trail_color(canvas.stream, canvas.scene.layout.of_type(Pose, Odometry))
-        canvas.draw(
-            "space/trail",
-            frame,
-            rr.LineStrips3D([[last.position, position]], colors=color, radii=rr.Radius.ui_points(2.0)),
-        )
+        segment = rr.LineStrips3D([[last.position, position]], colors=color, radii=rr.Radius.ui_points(2.0))
+        canvas.draw("space/trail", frame, segment)
     canvas.scene.trails[canvas.entity] = Trail(frame, position)
 
 
-def _axes(T: npt.NDArray[np.float64], length: float) -> rr.Arrows3D:
+def _axes(T: F64, length: float) -> rr.Arrows3D:
     return rr.Arrows3D(
         origins=np.repeat(T[None, :3, 3], 3, axis=0),
         vectors=T[:3, :3].T * length,
@@ -194,26 +174,20 @@ def _axes(T: npt.NDArray[np.float64], length: float) -> rr.Arrows3D:
     )
 
 
-def _ellipsoid(
-    canvas: Canvas, frame: str, center: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]
-) -> None:
+def _ellipsoid(canvas: Canvas, frame: str, center: F64, covariance: F64) -> None:
     """Two standard deviations of a position. A covariance that is none (not finite, not positive) is not drawn."""
     if not np.isfinite(covariance).all():
-        canvas.clear("space/covariance")
-        return
+        covariance = np.zeros((3, 3))
     variances, directions = np.linalg.eigh((covariance + covariance.T) / 2)
     if variances.min() < -1e-9 or variances.max() <= 0:
         canvas.clear("space/covariance")
         return
     if np.linalg.det(directions) < 0:
         directions[:, 0] *= -1
-    canvas.draw(
-        "space/covariance",
-        frame,
-        rr.Ellipsoids3D(
-            centers=[center],
-            half_sizes=[2 * np.sqrt(np.maximum(variances, 0))],
-            quaternions=[matrix_to_quaternion(directions)],
-            colors=(*colors.NEUTRAL, 120),
-        ),
+    ellipsoid = rr.Ellipsoids3D(
+        centers=[center],
+        half_sizes=[2 * np.sqrt(np.maximum(variances, 0))],
+        quaternions=[matrix_to_quaternion(directions)],
+        colors=(*colors.NEUTRAL, 120),
     )
+    canvas.draw("space/covariance", frame, ellipsoid)

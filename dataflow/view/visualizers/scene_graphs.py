@@ -27,7 +27,7 @@ from dataflow.messages.scene_summary import (
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.visualizers.clouds import finite_rows
-from dataflow.view.visualizers.scene_tree import tree
+from dataflow.view.visualizers.scene_tree import tree, with_act
 
 _LINE = (125, 130, 140)
 _PLACE = (80, 95, 110)
@@ -108,7 +108,8 @@ def _places(canvas: Canvas, message: SceneGraph, places: Sequence[int]) -> None:
         around = np.array([(x, y, -1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
         thin = int(np.argmin(half))
         corners = (around if thin == 2 or half[thin] > _SHEET else np.roll(around, thin + 1, axis=1)) * half
-        outlines.append(corners @ _axes_of(message, i).T + message.positions[i])
+        axes = np.eye(3) if message.orientations is None else quaternion_to_matrix(message.orientations[i])
+        outlines.append(corners @ axes.T + message.positions[i])
     if not _moved(canvas, "places", outlines):
         return
     names = message.names()
@@ -126,19 +127,16 @@ def _boxes(canvas: Canvas, path: str, message: SceneGraph, nodes: Sequence[int],
     if not _moved(canvas, path, rows):
         return
     names, classes = message.names(), class_names(message)
-    canvas.draw(
-        path,
-        message.frame,
-        rr.Boxes3D(
-            centers=message.positions[chosen],
-            half_sizes=message.sizes[chosen] / 2,
-            quaternions=turned,
-            colors=colors.of_classes([classes[i] for i in chosen]),
-            labels=[names[i] for i in chosen],
-            show_labels=labelled,
-            radii=rr.Radius.ui_points(1.5 if labelled else 1.0),
-        ),
+    boxes = rr.Boxes3D(
+        centers=message.positions[chosen],
+        half_sizes=message.sizes[chosen] / 2,
+        quaternions=turned,
+        colors=colors.of_classes([classes[i] for i in chosen]),
+        labels=[names[i] for i in chosen],
+        show_labels=labelled,
+        radii=rr.Radius.ui_points(1.5 if labelled else 1.0),
     )
+    canvas.draw(path, message.frame, boxes)
 
 
 def _agents(canvas: Canvas, message: SceneGraph, agents: Sequence[int], activities: Activity | None) -> None:
@@ -148,23 +146,16 @@ def _agents(canvas: Canvas, message: SceneGraph, agents: Sequence[int], activiti
     sizes = np.maximum(message.sizes[chosen], 2 * _THIN)
     radii = np.minimum(sizes[:, :2].mean(axis=1), sizes[:, 2]) / 2
     bottoms = message.positions[chosen] - np.column_stack([np.zeros((len(chosen), 2)), sizes[:, 2] / 2 - radii])
-    labels = []
-    for i in chosen:
-        act = acts.get(int(message.ids[i]))
-        labels.append(names[i] if act is None else f"{names[i]}: {spaced(act[0])}")
-    canvas.draw(
-        "space/agents",
-        message.frame,
-        rr.Capsules3D(
-            lengths=sizes[:, 2] - 2 * radii,
-            radii=radii,
-            translations=bottoms,
-            colors=colors.AGENT,
-            fill_mode=rr.components.FillMode.Solid,
-            labels=labels,
-            show_labels=True,
-        ),
+    capsules = rr.Capsules3D(
+        lengths=sizes[:, 2] - 2 * radii,
+        radii=radii,
+        translations=bottoms,
+        colors=colors.AGENT,
+        fill_mode=rr.components.FillMode.Solid,
+        labels=[with_act(names[i], acts.get(int(message.ids[i]))) for i in chosen],
+        show_labels=True,
     )
+    canvas.draw("space/agents", message.frame, capsules)
 
 
 def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: set[int]) -> None:
@@ -190,22 +181,15 @@ def _intentions(canvas: Canvas, message: SceneGraph, intentions: Sequence[Told])
             likely.append(r)
     starts = message.positions[[r.subject for r in likely]].reshape(-1, 3)
     ends = message.positions[[r.object for r in likely]].reshape(-1, 3)
-    canvas.draw(
-        "space/intentions",
-        message.frame,
-        rr.Arrows3D(
-            origins=starts,
-            vectors=ends - starts,
-            colors=[(*_INTENTION, round(80 + 175 * r.score)) for r in likely],
-            radii=rr.Radius.ui_points([1.0 + 2.5 * r.score for r in likely]),
-            labels=[percent(r.score) for r in likely],
-            show_labels=True,
-        ),
+    arrows = rr.Arrows3D(
+        origins=starts,
+        vectors=ends - starts,
+        colors=[(*_INTENTION, round(80 + 175 * r.score)) for r in likely],
+        radii=rr.Radius.ui_points([1.0 + 2.5 * r.score for r in likely]),
+        labels=[percent(r.score) for r in likely],
+        show_labels=True,
     )
-
-
-def _axes_of(message: SceneGraph, node: int) -> npt.NDArray[np.float64]:
-    return np.eye(3) if message.orientations is None else quaternion_to_matrix(message.orientations[node])
+    canvas.draw("space/intentions", message.frame, arrows)
 
 
 def _moved(canvas: Canvas, what: str, arrays: Sequence[npt.NDArray[np.float64]]) -> bool:

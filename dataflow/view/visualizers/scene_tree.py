@@ -8,14 +8,7 @@ import numpy as np
 import rerun as rr
 
 from dataflow.messages import Activity, SceneGraph
-from dataflow.messages.scene_summary import (
-    SceneSummary,
-    Told,
-    class_names,
-    doing,
-    grouped,
-    percent,
-)
+from dataflow.messages.scene_summary import SceneSummary, Told, class_names, doing, grouped, percent
 from dataflow.messages.scene_summary import spaced as words_of
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas
@@ -38,8 +31,8 @@ class Node:
     key: str
     label: str
     color: colors.RGB
-    x: float
-    y: float
+    x: float = 0.0
+    y: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +52,14 @@ def tree(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: Ac
     nodes, edges = arranged(message, told, activities)
     if not canvas.scene.changed(canvas.entity, "tree", (tuple(nodes), tuple(edges))):
         return
-    canvas.log(
-        "graph",
-        rr.GraphNodes(
-            node_ids=[n.key for n in nodes],
-            positions=[(n.x * WIDTH, n.y * HEIGHT) for n in nodes],
-            labels=[n.label for n in nodes],
-            colors=np.array([n.color for n in nodes], np.uint8).reshape(-1, 3),
-            show_labels=True,
-        ),
-        rr.GraphEdges(edges, graph_type="directed"),
+    drawn = rr.GraphNodes(
+        node_ids=[n.key for n in nodes],
+        positions=[(n.x * WIDTH, n.y * HEIGHT) for n in nodes],
+        labels=[n.label for n in nodes],
+        colors=np.array([n.color for n in nodes], np.uint8).reshape(-1, 3),
+        show_labels=True,
     )
+    canvas.log("graph", drawn, rr.GraphEdges(edges, graph_type="directed"))
 
 
 def arranged(
@@ -90,20 +80,14 @@ def _blocks(message: SceneGraph, told: SceneSummary) -> list[Block]:
         children = [c for c in told.carried(node) if c not in told.agents]
         if node in told.agents | told.places or not children:
             continue
-        key, kinds = _key(message, node), dict[str, list[int]]()
+        key, kinds, carried = _key(message, node), dict[str, list[int]](), []
         for child in children:
             kinds.setdefault(classes[child], []).append(child)
-        carried = tuple(
-            Node(
-                _key(message, several[0]) if len(several) == 1 else f"{key} {kind}",
-                grouped([names[c] for c in several], [kind] * len(several)),
-                colors.of_class(kind),
-                0.0,
-                0.0,
-            )
-            for kind, several in sorted(kinds.items(), key=lambda entry: -len(entry[1]))
-        )
-        blocks.append(Block(Node(key, names[node], colors.of_class(classes[node]), 0.0, 0.0), carried))
+        for kind, several in sorted(kinds.items(), key=lambda entry: -len(entry[1])):
+            label = grouped([names[c] for c in several], [kind] * len(several))
+            own = _key(message, several[0]) if len(several) == 1 else f"{key} {kind}"
+            carried.append(Node(own, label, colors.of_class(kind)))
+        blocks.append(Block(Node(key, names[node], colors.of_class(classes[node])), tuple(carried)))
     return blocks
 
 
@@ -124,11 +108,9 @@ def _in_columns(blocks: list[Block]) -> list[Block]:
     for c, column in enumerate(columns):
         row = 0
         for block in column:
-            x, middle = _AGENTS + c * width, row + (block.rows - 1) / 2
-            carried = (
-                replace(node, x=x + 0.45 * width, y=(row + k + 0.5) / rows) for k, node in enumerate(block.carried)
-            )
-            placed.append(Block(replace(block.carrier, x=x, y=(middle + 0.5) / rows), tuple(carried)))
+            x, beside = _AGENTS + c * width, _AGENTS + (c + 0.45) * width
+            carried = (replace(node, x=beside, y=(row + k + 0.5) / rows) for k, node in enumerate(block.carried))
+            placed.append(Block(replace(block.carrier, x=x, y=(row + block.rows / 2) / rows), tuple(carried)))
             row += block.rows
     return placed
 
@@ -146,9 +128,7 @@ def _agents(
     rows = max(_ROWS, sum(max(1, len(way)) for way in ways.values()))
     for agent in agents:
         key, act = _key(message, agent), acts.get(int(message.ids[agent]))
-        label = names[agent] if act is None else f"{names[agent]}: {words_of(act[0])}"
-        color = colors.AGENT
-        nodes.append(Node(key, label, color, 0.0, row / rows))
+        nodes.append(Node(key, with_act(names[agent], act), colors.AGENT, 0.0, row / rows))
         for relation in ways[agent]:
             word = words_of(relation.predicate)
             if relation in told.intentions:
@@ -161,6 +141,11 @@ def _agents(
             row += 1
         row += 0 if ways[agent] else 1
     return nodes, edges
+
+
+def with_act(name: str, act: tuple[str, float] | None) -> str:
+    """The label of an agent: its name, and what it does where that is known."""
+    return name if act is None else f"{name}: {words_of(act[0])}"
 
 
 def _ways(agent: int, told: SceneSummary) -> list[Told]:

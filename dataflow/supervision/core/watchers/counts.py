@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.supervision.core.report import OperatorCounts
@@ -13,7 +14,18 @@ from dataflow.supervision.core.watchers.watcher import Watcher
 
 MISSED = "missed"
 """The reason of messages that were lost on their way to a process that did not take them."""
-_NOTHING: Counter[tuple[str, str]] = Counter()
+
+
+@dataclass(slots=True)
+class _Tally:
+    """The counts of one operator; drops by input and reason, waits by input and kind."""
+
+    counts: OperatorCounts = field(default_factory=OperatorCounts)
+    drops: Counter[tuple[str, str]] = field(default_factory=Counter)
+    waits: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def after(self, base: _Tally) -> _Tally:
+        return _Tally(self.counts.after(base.counts), self.drops + base.drops, self.waits + base.waits)
 
 
 class Counts(Watcher):
@@ -21,13 +33,9 @@ class Counts(Watcher):
 
     def __init__(self, run: RunState) -> None:
         super().__init__(run)
-        self._base: dict[str, OperatorCounts] = {}
-        self._base_drops: dict[str, Counter[tuple[str, str]]] = {}
-        self._reported: dict[str, OperatorCounts] = {}
-        self._base_waits: dict[str, Counter[tuple[str, str]]] = {}
-        self._reported_waits: dict[str, Counter[tuple[str, str]]] = {}
-        self._reported_drops: dict[str, Counter[tuple[str, str]]] = {}
-        self._missed: dict[str, Counter[tuple[str, str]]] = {}
+        self._base: dict[str, _Tally] = defaultdict(_Tally)
+        self._reported: dict[str, _Tally] = defaultdict(_Tally)
+        self._missed: dict[str, Counter[tuple[str, str]]] = defaultdict(Counter)
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         match kind:
@@ -43,11 +51,11 @@ class Counts(Watcher):
         if (first := fields.get("first")) is not None:
             self.run.status.began = min(first, self.run.status.began or first)
         for name, values in counts.items():
-            self._reported[name] = OperatorCounts(*values)
+            self._reported[name].counts = OperatorCounts(*values)
         for name, found in drops.items():
-            self._reported_drops[name] = Counter({(input_name, why): n for input_name, why, n in found})
+            self._reported[name].drops = Counter({(input_name, why): n for input_name, why, n in found})
         for name, found in waits.items():
-            self._reported_waits[name] = Counter({(input_name, what): n for input_name, what, n in found})
+            self._reported[name].waits = Counter({(input_name, what): n for input_name, what, n in found})
         for name in dict.fromkeys((*counts, *drops, *waits)):
             self._update(name)
 
@@ -60,33 +68,18 @@ class Counts(Watcher):
             if stream in streams
         ]
         for name, input_name in takers or [(process.label, stream)]:
-            self._missed.setdefault(name, Counter())[input_name, MISSED] += max(0, number)
+            self._missed[name][input_name, MISSED] += max(0, number)
             self._update(name)
 
     def _update(self, name: str) -> None:
-        status = self.run.status
-        missed = self._missed.get(name)
-        counts = self._reported.get(name) or OperatorCounts()
-        if (base := self._base.get(name)) is not None:
-            counts = counts.after(base)
-        status.operators[name] = counts if not missed else counts.after(OperatorCounts(dropped=missed.total()))
-        if drops := _sum(self._reported_drops.get(name), self._base_drops.get(name), missed):
+        status, missed = self.run.status, self._missed[name]
+        found = self._reported[name].after(self._base[name])
+        status.operators[name] = found.counts.after(OperatorCounts(dropped=missed.total())) if missed else found.counts
+        if drops := found.drops + missed:
             status.drops[name] = drops
-        if waits := _sum(self._reported_waits.get(name), self._base_waits.get(name)):
-            status.waits[name] = waits
+        if found.waits:
+            status.waits[name] = found.waits
 
     def away(self, process: Supervised) -> None:
         for name in process.nodes:
-            if (reported := self._reported.pop(name, None)) is not None:
-                self._base[name] = reported.after(self._base.get(name, OperatorCounts()))
-            self._base_drops[name] = self._base_drops.get(name, Counter()) + self._reported_drops.pop(name, Counter())
-            self._base_waits[name] = self._base_waits.get(name, Counter()) + self._reported_waits.pop(name, Counter())
-
-
-def _sum(*counters: Counter[tuple[str, str]] | None) -> Counter[tuple[str, str]]:
-    """Adds what there is; mostly that is nothing, and then no counter is made of it."""
-    found = _NOTHING
-    for counter in counters:
-        if counter:
-            found = found + counter
-    return found
+            self._base[name] = self._reported.pop(name, _Tally()).after(self._base[name])

@@ -25,12 +25,9 @@ HUNG_AFTER = 5.0
 class Heartbeats(Watcher):
     """Takes in what the watchdogs of the processes say."""
 
-    def __init__(
-        self, run: RunState, cover: LiveCover, restarts: RestartPolicy, *, hung_after: float | None = None
-    ) -> None:
+    def __init__(self, run: RunState, cover: LiveCover, restarts: RestartPolicy) -> None:
         super().__init__(run)
         self._cover, self._restarts = cover, restarts
-        self._hung_after = HUNG_AFTER if hung_after is None else hung_after
         self._beats: dict[str, float] = {}
 
     def away(self, process: Supervised) -> None:
@@ -107,7 +104,7 @@ class Heartbeats(Watcher):
                 continue
             operator, stamp, seconds = process.work
             late = 2 * lags.get(operator, 0) >= max(lags.values(), default=0)  # not just another one that is slow
-            if seconds > self._hung_after and late and self.run.graph.nodes[operator].live.queue != "block":
+            if seconds > HUNG_AFTER and late and self.run.graph.nodes[operator].live.queue != "block":
                 cause = (
                     f"hangs in {operator!r}: its firing at stamp {stamp} has taken {seconds:.1f} s, "
                     f"and {messages} messages ({nbytes / 1e6:.1f} MB) wait"

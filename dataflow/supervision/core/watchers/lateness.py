@@ -12,7 +12,6 @@ from typing import Any
 from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.watcher import Watcher
-from dataflow.supervision.core.wording import how_long
 
 LATE = 1.0
 """Seconds behind the clock that are worth a word."""
@@ -47,6 +46,14 @@ def held_up_by(others: Sequence[str], read: float, sent: float, load: float, wal
         f"reading it computes for {computes:.0%} of the time that it takes, and for the rest it waits: for a device or "
         f"a file, or for the CPU, which it shares {beside}"
     )
+
+
+def how_long(seconds: float) -> str:
+    """Returns a span in words, however long it is."""
+    for unit, length in (("years", 365.25 * 86400), ("days", 86400.0), ("hours", 3600.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.0f} s"
 
 
 class Lateness(Watcher):
@@ -110,8 +117,5 @@ class Lateness(Watcher):
 
     def closing(self) -> None:
         for source, late in sorted(self._late.items()):
-            if self._worst[source] > LATE:
-                self.run.note(
-                    f"source {source!r} was {late:.1f} s behind the clock at the end, "
-                    f"{self._worst[source]:.1f} s at most"
-                )
+            if (worst := self._worst[source]) > LATE:
+                self.run.note(f"source {source!r} was {late:.1f} s behind the clock at the end, {worst:.1f} s at most")

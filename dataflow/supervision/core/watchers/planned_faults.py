@@ -43,13 +43,8 @@ class PlannedFaults(Watcher):
         process = next(p for p in run.processes.values() if fault.operator in p.nodes)
         if process.life is not Life.RUNNING:
             return  # it is away already, or has ended
-        run.event(
-            "fault",
-            f"planned fault at {fault.at:.2f} s: {fault.kind} {fault.operator}",
-            kind=fault.kind,
-            operator=fault.operator,
-            fields=dict(fault.fields),
-        )
+        text = f"planned fault at {fault.at:.2f} s: {fault.kind} {fault.operator}"
+        run.event("fault", text, kind=fault.kind, operator=fault.operator, fields=dict(fault.fields))
         match fault.kind:
             case "kill":
                 run.signal(process, signal.SIGKILL)

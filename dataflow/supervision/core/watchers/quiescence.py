@@ -8,8 +8,6 @@ process died, a link broke; live runs), the sums may differ for good: then what 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 from dataflow.supervision.core.life import WORKS
@@ -26,48 +24,29 @@ LOST_AFTER = 5.0
 MAX_WINDOW_DOUBLINGS = 12
 
 
-class Verdict(Enum):
-    """Holds what the answers of one round show."""
-
-    MOVING = "moving"
-    SETTLED = "settled"
-    PROVEN = "proven"
-
-
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """Envelopes sent and received by all processes together."""
-
-    sent: int
-    received: int
-
-
 class Proof:
     """Judges rounds of answers. `lost_after` (s): see above; None: nothing is ever lost."""
 
     def __init__(self, lost_after: float | None) -> None:
         self.lost_after = lost_after
-        self._totals: Totals | None = None
+        self._totals: tuple[int, int] | None = None
+        """Envelopes sent and received by all processes together."""
         self._since = 0.0
 
     def moved(self) -> None:
         """Something happened: what was shown so far shows nothing."""
         self._totals = None
 
-    def judge(self, answers: Sequence[Mapping[str, Any]], now: float) -> Verdict:
-        """Takes the answers of all processes to one question."""
+    def judge(self, answers: Sequence[Mapping[str, Any]], now: float) -> bool:
+        """Takes the answers of all processes to one question; returns whether nothing will happen any more."""
         if not all(a["idle"] for a in answers):
             self.moved()
-            return Verdict.MOVING
-        totals = Totals(sum(a["sent"] for a in answers), sum(a["received"] for a in answers))
-        if totals != self._totals:
-            self._totals, self._since = totals, now
-            return Verdict.SETTLED
-        if totals.sent == totals.received:
-            return Verdict.PROVEN
-        if self.lost_after is not None and now - self._since >= self.lost_after:
-            return Verdict.PROVEN
-        return Verdict.SETTLED
+            return False
+        sent, received = sum(a["sent"] for a in answers), sum(a["received"] for a in answers)
+        if (sent, received) != self._totals:
+            self._totals, self._since = (sent, received), now
+            return False
+        return sent == received or (self.lost_after is not None and now - self._since >= self.lost_after)
 
 
 class Quiescence(Watcher):
@@ -117,7 +96,10 @@ class Quiescence(Watcher):
         if not self.asked:
             self._ask()
         elif all(p.label in self._answers for p in run.working()):
-            self._conclude()
+            if self._proof.judge(list(self._answers.values()), run.steady):
+                self._proven()
+            else:
+                self._ask()
 
     def unanswered(self) -> list[Supervised]:
         """Returns the processes that have owed an answer for longer than one needs."""
@@ -131,13 +113,6 @@ class Quiescence(Watcher):
         self.asked = True
         self._answers.clear()
         self.run.send_all("poll", replaces=True, round=self._round)
-
-    def _conclude(self) -> None:
-        match self._proof.judge(list(self._answers.values()), self.run.steady):
-            case Verdict.PROVEN:
-                self._proven()
-            case Verdict.SETTLED | Verdict.MOVING:
-                self._ask()
 
     def _proven(self) -> None:
         run = self.run

@@ -7,7 +7,7 @@ operator that raises while it works is restarted within its process, by the same
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.execution.restarts import Restarts
@@ -48,11 +48,10 @@ class RestartPolicy(Watcher):
 class LiveRestarts(RestartPolicy):
     """Restarts by the operators' policies."""
 
-    def __init__(self, run: RunState, remains: LeftoverRecords, tell: Callable[[str, Supervised], None]) -> None:
-        """`tell` passes "away" and "back" on to all parts."""
+    def __init__(self, run: RunState, remains: LeftoverRecords, parts: Sequence[Watcher]) -> None:
+        """`parts`: all watchers of the run, which are notified of processes that go and come back."""
         super().__init__(run)
-        self._remains = remains
-        self._tell = tell
+        self._remains, self._parts = remains, parts
         self._pairs = tuple(pairs_of(run.graph, {label: process.plan for label, process in run.processes.items()}))
         self._attempts: dict[str, Restarts] = {}
         self._ended_streams: dict[str, str] = {}
@@ -92,14 +91,10 @@ class LiveRestarts(RestartPolicy):
             self._remains.hand_over(process.nodes)
         tell_consumers(run, process, absent=True)
         self._tell_producers(process)
-        self._tell("away", process)
-        run.event(
-            "restart",
-            f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s",
-            operators=list(process.nodes),
-            cause=how,
-            **failed_in,
-        )
+        for part in self._parts:
+            part.away(process)
+        text = f"{process.describe()} {how}; started again in {self._attempts[process.label].due_in():.2g} s"
+        run.event("restart", text, operators=list(process.nodes), cause=how, **failed_in)
 
     def _tell_producers(self, process: Supervised) -> None:
         """Notifies the producers of a process that it no longer takes their messages."""
@@ -173,7 +168,8 @@ class LiveRestarts(RestartPolicy):
             for each in run.working():
                 for name in each.nodes:
                     run.send(each, "lacks", operator=name)
-        self._tell("back", process)
+        for part in self._parts:
+            part.back(process)
         run.event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
 
     # News
@@ -184,16 +180,10 @@ class LiveRestarts(RestartPolicy):
             case "restarting":
                 name = fields["operator"]
                 run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
-                where = f" ({fields['where']})" if fields["where"] else ""
-                run.event(
-                    "restart",
-                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}{where}; "
-                    f"made anew in {fields['pause']:.2g} s",
-                    operators=[name],
-                    cause=fields["summary"],
-                    where=fields["where"],
-                    traceback=fields["traceback"],
-                )
+                cause, where, traceback = fields["summary"], fields["where"], fields["traceback"]
+                text = f"operator {name!r} failed in {fields['when']}: {cause}{f' ({where})' if where else ''}"
+                text += f"; made anew in {fields['pause']:.2g} s"
+                run.event("restart", text, operators=[name], cause=cause, where=where, traceback=traceback)
             case "reloaded":
                 name = fields["operator"]
                 which = "new code" if fields["changed"] else "the code that it had, whose files are as they were,"
@@ -204,14 +194,8 @@ class LiveRestarts(RestartPolicy):
                 self._ended_streams[fields["stream"]] = fields["reason"]
             case "gap":
                 stream, first, following = fields["stream"], fields["first"], fields["following"]
-                run.event(
-                    "gap",
-                    f"{process.label} did not get {stream} {first} to {following - 1}",
-                    taker=process.label,
-                    stream=stream,
-                    first=first,
-                    following=following,
-                )
+                text = f"{process.label} did not get {stream} {first} to {following - 1}"
+                run.event("gap", text, taker=process.label, stream=stream, first=first, following=following)
             case "jumped":
                 name, stamp = fields["operator"], fields["stamp"]
                 run.event("clock_jump", f"the clock of {name!r} jumped back to {stamp}", operator=name, stamp=stamp)

@@ -7,12 +7,11 @@ from typing import Any
 
 from dataflow.supervision.core.life import WORKS
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import RunState
-from dataflow.supervision.core.stack_requests import Asking, notice
+from dataflow.supervision.core.run_state import Asking, RunState, notice
 from dataflow.supervision.core.supervised import Supervised
+from dataflow.supervision.core.watchers.lateness import how_long
 from dataflow.supervision.core.watchers.quiescence import Quiescence
 from dataflow.supervision.core.watchers.watcher import Watcher
-from dataflow.supervision.core.wording import how_long
 
 PING_AFTER = 1.0
 """Seconds after which a process that sends nothing is asked for a sign of life."""

@@ -1,4 +1,4 @@
-"""Material with planted faults: made by hand, or by the simulated robot, which knows the truth."""
+"""LintInput with planted faults: made by hand, or by the simulated robot, which knows the truth."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.lint.finding import Finding
-from dataflow.lint.material import Stamps, StreamFacts
+from dataflow.lint.inputs import Finding, Stamps, StreamFacts
 from dataflow.messages import Message
 
 SECOND = 1_000_000_000
 BEGIN = 1_700_000_000 * SECOND
 
 
-class MadeMaterial:
+class MadeInput:
     """Messages by stream, in the order given; or timestamps alone."""
 
     namespace = "robot1"

@@ -1,21 +1,37 @@
-"""The material of a look: anything that has streams with timestamps and messages."""
+"""Inputs of the checks, anything that has streams with timestamps and messages, and the findings there."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.lint.finding import Finding
 from dataflow.messages import Message
 from dataflow.recording import Recording
 from dataflow.recording.layout import RECORDING, Kind
 from dataflow.recording.mcap.index import NO_END
 
 Stamps = npt.NDArray[np.int64]
+Severity = Literal["note", "warning", "error"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """`check` names what was looked for; `values` holds its figures by name, units in the names."""
+
+    check: str
+    stream: str
+    severity: Severity
+    text: str
+    at: int | None = None
+    """The first stamp (ns) at which it shows."""
+    values: Mapping[str, float | int | str] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +44,7 @@ class StreamFacts:
     readable: bool
 
 
-class Material(Protocol):
+class LintInput(Protocol):
     """A recording of any kind. Streams are given by name, in the order they are to be reported in."""
 
     @property
@@ -50,8 +66,8 @@ class Material(Protocol):
         ...
 
 
-class RecordedMaterial:
-    """An open recording as material; the runtime's own streams are left out."""
+class RecordingInput:
+    """An open recording; the runtime's own streams are left out."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
