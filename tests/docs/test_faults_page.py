@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import get_args
 
-from dataflow.chaos import kinds
+from dataflow.chaos import faults as kinds
 from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
 from dataflow.supervision.core.health import LEVELS
@@ -39,8 +39,8 @@ SHOWN_BY = {
     """,
     "an operator is slow": "a_slow_operator_drops_by_its_policy_and_holds_up_nobody",
     "a process gives no sign of life (stopped, swapped out)": """
-        a_stopped_process_is_killed_and_restarted_by_its_policy
-        a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back
+        a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy
+        stopped_consumer_is_not_waited_for_and_starts_a_new_backlog
         what_did_not_reach_a_consumer_is_counted_against_it
     """,
     "a process lives and takes no messages (a call that holds the interpreter)": """
