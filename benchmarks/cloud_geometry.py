@@ -223,8 +223,7 @@ def numbered(depth: DepthImage) -> NDArray[np.uint8]:
 def pixels_of(coded: PointCloud) -> NDArray[np.int64]:
     """The pixel (N,) of each point of a cloud with such colours."""
     assert coded.colors is not None
-    pixel: NDArray[np.int64] = coded.colors.astype(np.int64) @ [65536, 256, 1]
-    return pixel
+    return np.asarray(coded.colors.astype(np.int64) @ [65536, 256, 1], np.int64)
 
 
 def run(world: str, seed: int, frames: int) -> Score:

@@ -77,7 +77,7 @@ def main() -> None:
         said: dict[int, int] = {}
         blind: dict[int, int] = {}
         switches = seen = held = false = 0
-        places, speeds, raw = [], [], []
+        places, speeds, raw = list[float](), list[float](), list[float]()
         before: SceneGraph | None = None
         graphs = scenes(WORLDS[k % 3], FIRST + k)
         travelled = np.ptp([g.positions for g in graphs], axis=0).max(axis=1)

@@ -234,7 +234,7 @@ def main() -> None:
     base = float(np.median(cpu["full"]))
     table: list[dict[str, Any]] = []
     for name in methods:
-        row = {"method": name, **score(poses[name], truth, min(arguments.delta, len(frames) - 1))}
+        row: dict[str, Any] = {"method": name, **score(poses[name], truth, min(arguments.delta, len(frames) - 1))}
         row |= {**spread(times[name], "ms"), **spread(cpu[name], "cpu_ms")}
         row["cpu_ratio"] = row["median_cpu_ms"] / base
         if name in results:
