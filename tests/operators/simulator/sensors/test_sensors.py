@@ -17,9 +17,9 @@ from operators.simulator import SimulatedRobot
 from operators.simulator.rendering.optics import View
 from operators.simulator.scene import Builder, Light, World
 from operators.simulator.sensors import color, depth, radar
+from operators.simulator.sensors.color import NoisePool
 from operators.simulator.sensors.frames import BODY_TO_OPTICAL, mounted
 from operators.simulator.sensors.gnss import geodetic
-from operators.simulator.sensors.color import NoisePool
 from operators.simulator.sensors.schedule import merged, ticks
 from operators.simulator.sensors.wheels import WheelModel
 from operators.simulator.settings import DepthCamera, Radar, Wheels
