@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_onnx import node, write_model
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, RelativeDepth
@@ -17,26 +18,16 @@ from dataflow.testing import Played, play
 from operators.depth import MonoDepth
 from operators.depth.mono_depth import fitted
 
-onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnx")
 
 WIDTH, HEIGHT = 64, 48
 GAIN, BASE = 100.0, 30.0  # brightness of 1/depth
 
 
-def network(file: Path, shape: tuple[Any, ...] = (1, 3, HEIGHT, WIDTH), kept: int = 1, kind: str = "FLOAT") -> Path:
+def network(file: Path, shape: tuple[Any, ...] = (1, 3, HEIGHT, WIDTH), kind: str = "FLOAT") -> Path:
     """Writes a network whose output is the mean of the three channels."""
-    from onnx import TensorProto, helper
-
-    node = helper.make_node("ReduceMean", ["input"], ["output"], axes=[1], keepdims=kept)
-    graph = helper.make_graph(
-        [node],
-        "mean",
-        [helper.make_tensor_value_info("input", getattr(TensorProto, kind), shape)],
-        [helper.make_tensor_value_info("output", getattr(TensorProto, kind), None)],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    onnx.save(model, str(file))
-    return file
+    mean = node("ReduceMean", "input", "output", axes=[1], keepdims=1)
+    return Path(write_model(file, [mean], {"input": (kind, shape)}, {"output": (kind, None)}))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 from served_models import model_of
 
 from dataflow.messages import Image, RelativeDepth, SegmentationMap
@@ -22,7 +23,7 @@ from operators.models import registry
 from operators.segmentation import OnnxSegmenter
 from operators.weights import shipped
 
-onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnx")
 
 IMAGE = Image(stamp=1, frame="camera", data=np.random.default_rng(2).integers(0, 256, (20, 30, 3)).astype(np.uint8))
 Registered = Callable[..., str]
@@ -30,17 +31,9 @@ Registered = Callable[..., str]
 
 def network(file: Path, planes: int, size: tuple[int | str, int | str] = ("h", "w")) -> Path:
     """A network that answers with the mean of the three channels, in so many planes."""
-    make, kind = onnx.helper, onnx.TensorProto.FLOAT
-    weights = onnx.numpy_helper.from_array(np.full((planes, 3, 1, 1), 1 / 3, np.float32), "w")
-    graph = make.make_graph(
-        [make.make_node("Conv", ["x", "w"], ["y"])],
-        "mean",
-        [make.make_tensor_value_info("x", kind, [1, 3, *size])],
-        [make.make_tensor_value_info("y", kind, None)],
-        [weights],
-    )
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return file
+    weights = np.full((planes, 3, 1, 1), 1 / 3, np.float32)
+    ports = {"x": [1, 3, *size]}, {"y": None}
+    return Path(write_model(file, [node("Conv", "x w", "y")], *ports, values={"w": weights}))
 
 
 @pytest.fixture
