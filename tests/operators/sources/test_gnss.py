@@ -288,12 +288,7 @@ def test_a_receiver_that_is_unplugged_goes_on_when_it_is_back(tmp_path: Path, ca
     assert list(fixes) == []
     source.close()
     assert second.stamp - first.stamp == 4 * 10**9
-    assert source.summary() == {
-        "clock": "receiver",
-        "sentences": "GGA 2, RMC 1",
-        "bad_sentences": 1,
-        "unplugged": 1,
-    }
+    assert source.summary() == {"clock": "receiver", "sentences": "GGA 2, RMC 1", "bad_sentences": 1, "unplugged": 1}
     [warning] = [record for record in caplog.records if record.levelname == "WARNING"]
     assert "is gone" in warning.getMessage()
     os.close(cable.end)

@@ -90,12 +90,6 @@ def test_the_sensors_clock_gives_the_time_within_the_hour(tmp_path: Path) -> Non
 
 
 @need
-def test_a_capture_that_breaks_off_gives_what_it_holds(tmp_path: Path) -> None:
-    clouds = play(VelodyneFile(input=str(capture(tmp_path / "a.pcap", [packet(k) for k in range(160)], cut=1250))))
-    assert len(clouds["cloud"]) == 3
-
-
-@need
 def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) -> None:
     whole = capture(tmp_path / "a.pcap", [packet(k) for k in range(160)])
     data, record = whole.read_bytes(), 16 + 42 + 1206
@@ -106,7 +100,7 @@ def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) ->
     ):
         (tmp_path / f"{name}.pcap").write_bytes(content)
         source = VelodyneFile(input=str(tmp_path / f"{name}.pcap"))
-        assert play(source)["cloud"]
+        assert len(play(source)["cloud"]) == (2 if name != "cut" else 3)
         assert why in source.finding()
     source = VelodyneFile(input=str(whole))
     play(source)
@@ -114,13 +108,19 @@ def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) ->
 
 
 @need
-@pytest.mark.parametrize(("magic", "advice"), [(b"\n\r\r\n", "editcap -F pcap"), (b"\x1f\x8b", "gunzip")])
-def test_captures_of_other_kinds_are_named(magic: bytes, advice: str, tmp_path: Path) -> None:
-    (tmp_path / "a.pcap").write_bytes(magic + bytes(100))
-    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
-    source.setup()
-    with pytest.raises(SourceError, match=advice):
-        list(source.stream())
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\n\r\r\n" + bytes(100), "editcap -F pcap"),
+        (b"\x1f\x8b" + bytes(100), "gunzip"),
+        (b"", "is no capture of packets"),
+        (b"no capture at all, but a longer text than a header", "is no capture of packets"),
+    ],
+)
+def test_a_file_that_is_no_capture_is_named(content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.pcap").write_bytes(content)
+    with pytest.raises(Exception, match=words):
+        play(VelodyneFile(input=str(tmp_path / "a.pcap")))
 
 
 @need
@@ -165,16 +165,6 @@ def test_packets_of_another_sensors_model_are_left_out(tmp_path: Path, caplog: p
     assert (mixed.summary()["packets"], mixed.summary()["other_datagrams"]) == (160, 2)
     assert caplog.text.count("packets of model 40 are left out: those before are of model 34") == 1
     assert len(play(before)["cloud"]) == len(alone)
-
-
-@need
-@pytest.mark.parametrize("content", [b"", b"no capture at all, but a longer text than a header"])
-def test_a_file_that_is_no_capture_is_named(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.pcap").write_bytes(content)
-    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
-    source.setup()
-    with pytest.raises(SourceError, match="is no capture of packets"):
-        list(source.stream())
 
 
 @need
