@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import socket
 import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plugged import free_port, send_datagrams
 
 from dataflow.messages import PointCloud
 from dataflow.operator import SourceError
@@ -196,9 +196,7 @@ def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.
 
 
 def over_loopback() -> tuple[VelodyneLidar, int]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     source = VelodyneLidar(input=f"udp://127.0.0.1:{port}")
     source.setup()
     return source, port
@@ -207,10 +205,7 @@ def over_loopback() -> tuple[VelodyneLidar, int]:
 @need
 def test_datagrams_of_loopback_become_clouds() -> None:
     source, port = over_loopback()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for k in range(90):
-            sender.sendto(packet(k), ("127.0.0.1", port))
-        sender.sendto(b"position", ("127.0.0.1", port))
+    send_datagrams(port, *(packet(k) for k in range(90)), b"position")
     cloud = next(source.stream())["cloud"]
     source.close()
 
@@ -225,9 +220,7 @@ def test_packets_wait_for_a_late_graph_and_those_without_room_are_counted(
 ) -> None:
     monkeypatch.setattr(ports, "BUFFER", buffer)
     source, port = over_loopback()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for k in range(150):
-            sender.sendto(packet(k), ("127.0.0.1", port))
+    send_datagrams(port, *(packet(k) for k in range(150)))
     kept = 0
     while ports.read_port(source._port)[0] is not None:
         kept += 1
