@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -45,3 +46,16 @@ def write_model(file: Path, nodes: Iterable[Any], *ports: Mapping[str, Any], **o
 
     onnx.save(onnx_model(nodes, *ports, **others), str(file))
     return str(file)
+
+
+def with_facts(file: Path, out: Path, **facts: Any) -> Path:
+    """Writes a network's file with other facts in its metadata; None takes one out."""
+    import onnx
+
+    model = onnx.load(str(file))
+    kept = {each.key: each.value for each in model.metadata_props}
+    told = json.loads(kept["dataflow.network"]) | facts
+    kept["dataflow.network"] = json.dumps({name: value for name, value in told.items() if value is not None})
+    onnx.helper.set_model_props(model, kept)
+    onnx.save(model, str(out))
+    return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_onnx import node, write_model
-from served_models import model_of
+from served_models import model_of, write_row
 
 from dataflow.messages import Image, RelativeDepth, SegmentationMap
 from dataflow.operator import Operator
@@ -42,11 +41,10 @@ def registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registered:
 
     def write(operator: type[Operator], planes: int = 1, **fields: Any) -> str:
         file = network(tmp_path / "mine.onnx", planes)
-        row = model_of(file.read_bytes(), url="http://127.0.0.1:9/net.onnx").model_dump(exclude_none=True)
-        row |= {"operator": f"{operator.__module__}:{operator.__name__}", **fields}
+        row = model_of(file.read_bytes(), url="http://127.0.0.1:9/net.onnx")
         own = tmp_path / f"own{len(list(tmp_path.iterdir()))}.yaml"  # a file is read once
-        own.write_text(json.dumps({"models": {row.pop("name"): row}}))
-        monkeypatch.setenv(registry.REGISTRIES, str(own))
+        fields["operator"] = f"{operator.__module__}:{operator.__name__}"
+        monkeypatch.setenv(registry.REGISTRIES, write_row(own, row, **fields))
         return str(file)
 
     return write

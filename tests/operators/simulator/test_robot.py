@@ -9,16 +9,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import made_robot
 import numpy as np
 import pytest
+from made_robot import OFF, QUIET, SMALL, run
 
 from dataflow.messages import CompressedDepth, CompressedImage, Image, Message
 from dataflow.operator import ParameterError
 from operators.codec import DepthDecoder, ImageDecoder
 from operators.simulator import SimulatedRobot
 
-SMALL = {"width": 64, "height": 48}
-QUIET: dict[str, Any] = {"poses": 0, "boxes": False, "relations": 0, "activities": 0}
 EVERYTHING: dict[str, Any] = {
     "seed": 5,
     "duration": "600ms",
@@ -36,16 +36,6 @@ EVERYTHING: dict[str, Any] = {
     "faults": [{"sensor": "lidar", "span": [0.3, 0.5], "set": {"noise": 0.1}}],
     "truth": {"masks": True, "occupancy": True, "surfaces": True, "mesh": True, "events": True},
 }
-
-
-def run(**params: Any) -> dict[str, list[Message]]:
-    robot = SimulatedRobot(**params)
-    robot.setup()
-    streams: dict[str, list[Message]] = {port: [m] for port, m in robot.static_outputs().items()}
-    for step in robot.stream():
-        for port, message in step.items():
-            streams.setdefault(port, []).append(message)
-    return streams
 
 
 def digest(streams: dict[str, list[Message]]) -> str:
@@ -73,7 +63,7 @@ def test_every_declared_port_is_fed_when_everything_is_on(everything: dict[str, 
 def test_fresh_processes_make_the_same_bytes_with_one_thread_and_with_two(everything: dict[str, list[Message]]) -> None:
     def started(threads: int, hash_seed: str) -> subprocess.Popen[str]:
         program = (
-            f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+            f"import sys; sys.path[:0] = {[str(Path(p).parent) for p in (__file__, made_robot.__file__)]!r}\n"
             "from test_robot import EVERYTHING, digest, run\n"
             f"print(digest(run(**EVERYTHING, threads={threads})))"
         )
@@ -99,9 +89,6 @@ def test_a_robot_set_up_twice_makes_the_same_bytes_again() -> None:
     assert digests[0] == digests[1]
 
 
-NO_CAMERAS: dict[str, Any] = {"color_camera": {**SMALL, "rate": 0}, "depth_camera": {"rate": 0}, "truth": QUIET}
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("sensor", "ports"),
@@ -124,7 +111,7 @@ def test_a_sensor_measures_the_same_alone_and_beside_all_others(
 ) -> None:
     shared = {name: EVERYTHING[name] for name in ("seed", "duration", "motion", "faults")}
     seen = {"truth": {**QUIET, "boxes": True, "masks": True}} if sensor == "color_camera" else {}
-    alone = run(**{**NO_CAMERAS, **shared, **seen, sensor: EVERYTHING[sensor]})
+    alone = run(**{**OFF, **shared, **seen, sensor: EVERYTHING[sensor]})
     for port in {*ports, *(("objects", "boxes", "masks") if seen else ())}:
         assert alone[port] == everything[port], port
 
@@ -186,7 +173,7 @@ def test_dropout_loses_its_share_and_outages_all_but_not_the_truth() -> None:
 def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
     quiet = {"rate": 100, "gyro_noise": 0, "gyro_walk": 0, "accel_noise": 0, "accel_walk": 0}
     sharp, late = (
-        run(**{**NO_CAMERAS, "movers": False, "duration": "3s", "inertial": {**quiet, "delay": delay}})["imu"]
+        run(**{**OFF, "movers": False, "duration": "3s", "inertial": {**quiet, "delay": delay}})["imu"]
         for delay in (0, "50ms")
     )
     turning = np.array([m.angular_velocity[2] for m in sharp])  # type: ignore[attr-defined]
