@@ -214,7 +214,7 @@ def made_by(builder: CloudBuilder, *given: Any) -> PointCloud:
 
 
 def numbered(depth: DepthImage) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) that are pixel numbers: a cloud with them tells the pixel of each of its points."""
+    """Colours (H, W, 3) that are pixel numbers, so that each point of a cloud shows its pixel."""
     rows, columns = np.mgrid[: depth.height, : depth.width]
     number = (rows * depth.width + columns).astype(np.int64)
     return np.stack([number >> 16, (number >> 8) & 255, number & 255], axis=-1).astype(np.uint8)

@@ -42,7 +42,7 @@ def scenes(world: str, seed: int) -> list[SceneGraph]:
 def measured(
     graph: SceneGraph, rows_of: list[int], blind: dict[int, int], rng: np.random.Generator
 ) -> tuple[Solids, NDArray[np.float64]]:
-    """What a detector gives of these rows of a scene, with gaps and false boxes, and how far off (N,) its boxes are."""
+    """Boxes of these rows of a scene as a detector gives them, with gaps and false ones, and their errors (N,)."""
     kept = []
     for j, i in zip(rows_of, graph.ids[rows_of].tolist(), strict=True):
         blind[i] = blind.get(i, 0) - 1
