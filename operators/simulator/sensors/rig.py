@@ -66,7 +66,7 @@ class Rig:
             "wheels": self.wheels,
             **{name: partial(self._single, *how) for name, how in single.items()},
         }
-        """What each sensor measures, by its parameter: (settings, seconds, tick, random numbers) → messages."""
+        """Measurements by the parameter of their sensor: (settings, seconds, tick, random numbers) → messages."""
 
     def color(self, camera: settings.ColorCamera, t: float, tick: Tick, rng: Rng) -> Messages:
         T_base_camera = displaced_optical(self.T_base_color, camera.mount_error)
