@@ -213,6 +213,19 @@ def made_by(builder: CloudBuilder, *given: Any) -> PointCloud:
     return cloud
 
 
+def numbered(depth: DepthImage) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) that are pixel numbers, so that each point of a cloud shows its pixel."""
+    rows, columns = np.mgrid[: depth.height, : depth.width]
+    number = (rows * depth.width + columns).astype(np.int64)
+    return np.stack([number >> 16, (number >> 8) & 255, number & 255], axis=-1).astype(np.uint8)
+
+
+def pixels_of(coded: PointCloud) -> NDArray[np.int64]:
+    """The pixel (N,) of each point of a cloud with such colours."""
+    assert coded.colors is not None
+    return np.asarray(coded.colors.astype(np.int64) @ [65536, 256, 1], np.int64)
+
+
 def run(world: str, seed: int, frames: int) -> Score:
     score = Score()
     camera: dict[str, Any] = {"rate": 1.0}
@@ -242,14 +255,8 @@ def run(world: str, seed: int, frames: int) -> Score:
         assert isinstance(masks, SegmentationMap)
         assert isinstance(boxes, Boxes3D)
         assert masks.instances is not None
-        # classes and instances of the points: a second cloud whose colours are pixel numbers
-        rows, columns = np.mgrid[: depth.height, : depth.width]
-        number = (rows * depth.width + columns).astype(np.int64)
-        code = np.stack([number >> 16, (number >> 8) & 255, number & 255], axis=-1).astype(np.uint8)
         cloud = made_by(builder, depth, image, info, image_info, extrinsics)
-        coded = made_by(builder, depth, image.replace(data=code), info, image_info)
-        assert coded.colors is not None
-        pixel = coded.colors.astype(np.int64) @ [65536, 256, 1]
+        pixel = pixels_of(made_by(builder, depth, image.replace(data=numbered(depth)), info, image_info))
         classes, instances = masks.classes.ravel()[pixel], masks.instances.ravel()[pixel]
         segmenter.seed_rng(k)
         start = time.perf_counter()

@@ -54,7 +54,7 @@ def main() -> None:
     source.setup()
     statics: Any = source.static_outputs()
     rows: dict[str, list[list[float]]] = {}
-    spent, missing = [], dict[str, int]()
+    spent, missing = list[float](), dict[str, int]()
     for k, step in enumerate(source.stream()):
         given: Any = step
         if k % arguments.every:
@@ -94,6 +94,10 @@ def main() -> None:
         middle = np.full_like(truth, np.median(truth.ravel()[known]))
         e = depth_errors(middle, truth)
         rows.setdefault("one depth for all pixels: the median", []).append([e.relative, e.middle, e.rmse, e.near, 1])
+    report(rows, missing, spent)
+
+
+def report(rows: dict[str, list[list[float]]], missing: dict[str, int], spent: list[float]) -> None:
     titles = (
         "aligned to", "frames", "no scale", "mean error", "worst", "median", "RMSE m", "within 25 %", "measured"
     )  # fmt: skip

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import SceneGraph, TrackState
 from dataflow.messages.geometry import yaw_of
@@ -38,6 +39,33 @@ def scenes(world: str, seed: int) -> list[SceneGraph]:
     return [g for g in found if isinstance(g, SceneGraph)]
 
 
+def measured(
+    graph: SceneGraph, rows_of: list[int], blind: dict[int, int], rng: np.random.Generator
+) -> tuple[Solids, NDArray[np.float64]]:
+    """Boxes of these rows of a scene as a detector gives them, with gaps and false ones, and their errors (N,)."""
+    kept = []
+    for j, i in zip(rows_of, graph.ids[rows_of].tolist(), strict=True):
+        blind[i] = blind.get(i, 0) - 1
+        if blind[i] < -3 and rng.random() < 0.02:
+            blind[i] = int(rng.integers(3, 10))
+        if blind[i] <= 0 and rng.random() < 0.9:
+            kept.append(j)
+    count = int(rng.poisson(0.2))
+    assert graph.orientations is not None
+    assert graph.sizes is not None
+    centers = graph.positions[kept] + rng.normal(0, 0.08, (len(kept), 3))
+    spots = rng.uniform([-4, -4, 0.3], [4, 4, 1.2], (count, 3))
+    yaws = yaw_of(graph.orientations[kept]) + np.pi * rng.integers(0, 2, len(kept)) if kept else np.zeros(0)
+    found = Solids(
+        np.concatenate([centers, spots]),
+        np.concatenate([graph.sizes[kept] * rng.normal(1, 0.1, (len(kept), 3)), np.full((count, 3), 0.5)]),
+        np.concatenate([yaws, np.zeros(count)]),
+        np.concatenate([rng.uniform(0.6, 0.95, len(kept)), rng.uniform(0.2, 0.6, count)]),
+        np.concatenate([graph.class_ids[kept], rng.choice(graph.class_ids[rows_of], count)]).astype(np.int32),
+    )
+    return found, np.linalg.norm(centers - graph.positions[kept], axis=1)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
@@ -49,7 +77,7 @@ def main() -> None:
         said: dict[int, int] = {}
         blind: dict[int, int] = {}
         switches = seen = held = false = 0
-        places, speeds, raw = [], [], []
+        places, speeds, raw = list[float](), list[float](), list[float]()
         before: SceneGraph | None = None
         graphs = scenes(WORLDS[k % 3], FIRST + k)
         travelled = np.ptp([g.positions for g in graphs], axis=0).max(axis=1)
@@ -57,27 +85,8 @@ def main() -> None:
             names = [graph.class_names[c] for c in graph.class_ids.tolist()]
             rows_of = [j for j, n in enumerate(names) if n in MOVERS and travelled[j] > 0.2]
             ids = graph.ids[rows_of].tolist()
-            kept = []
-            for j, i in zip(rows_of, ids, strict=True):
-                blind[i] = blind.get(i, 0) - 1
-                if blind[i] < -3 and rng.random() < 0.02:
-                    blind[i] = int(rng.integers(3, 10))
-                if blind[i] <= 0 and rng.random() < 0.9:
-                    kept.append(j)
-            count = int(rng.poisson(0.2))
-            assert graph.orientations is not None
-            assert graph.sizes is not None
-            centers = graph.positions[kept] + rng.normal(0, 0.08, (len(kept), 3))
-            spots = rng.uniform([-4, -4, 0.3], [4, 4, 1.2], (count, 3))
-            raw.extend(np.linalg.norm(centers - graph.positions[kept], axis=1))
-            yaws = yaw_of(graph.orientations[kept]) + np.pi * rng.integers(0, 2, len(kept)) if kept else np.zeros(0)
-            found = Solids(
-                np.concatenate([centers, spots]),
-                np.concatenate([graph.sizes[kept] * rng.normal(1, 0.1, (len(kept), 3)), np.full((count, 3), 0.5)]),
-                np.concatenate([yaws, np.zeros(count)]),
-                np.concatenate([rng.uniform(0.6, 0.95, len(kept)), rng.uniform(0.2, 0.6, count)]),
-                np.concatenate([graph.class_ids[kept], rng.choice(graph.class_ids[rows_of], count)]).astype(np.int32),
-            )
+            found, off = measured(graph, rows_of, blind, rng)
+            raw.extend(off)
             tracks = [
                 t
                 for t in tracker.update(graph.stamp, found)

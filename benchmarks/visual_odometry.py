@@ -173,7 +173,7 @@ class Open3dFrameToModel:
         return self.T
 
 
-def main() -> None:
+def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["recorded", "worlds"], nargs="?", default="recorded")
     parser.add_argument("worlds", nargs="*", default=[], help="KIND:SEED (default: twelve that nothing is tuned on)")
@@ -184,7 +184,11 @@ def main() -> None:
     parser.add_argument("--color-focal", type=float, default=525.0, help="focal length of the colour camera, px")
     parser.add_argument("--delta", type=int, default=30, help="frames over which RPE is taken")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    arguments = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    arguments = options()
     cv2.setNumThreads(1)
     if arguments.what == "worlds":
         odometry_worlds.table(arguments.worlds or list(odometry_worlds.WORLDS), arguments.cache)
@@ -228,17 +232,10 @@ def main() -> None:
             poses[name].append(T)
 
     base = float(np.median(cpu["full"]))
-    table = []
+    table: list[dict[str, Any]] = []
     for name in methods:
-        row: dict[str, Any] = {
-            "method": name,
-            **score(poses[name], truth, min(arguments.delta, len(frames) - 1)),
-        }
-        for label, spent in (("ms", times[name]), ("cpu_ms", cpu[name])):
-            row |= {
-                f"median_{label}": float(np.median(spent)),
-                f"p95_{label}": float(np.percentile(spent, 95)),
-            }
+        row: dict[str, Any] = {"method": name, **score(poses[name], truth, min(arguments.delta, len(frames) - 1))}
+        row |= {**spread(times[name], "ms"), **spread(cpu[name], "cpu_ms")}
         row["cpu_ratio"] = row["median_cpu_ms"] / base
         if name in results:
             row["statuses"] = dict(Counter(str(r.status) for r in results[name]))
@@ -246,8 +243,16 @@ def main() -> None:
         table.append(row)
     if arguments.json:
         print(json.dumps({"frames": len(frames), "stride": arguments.stride, "methods": table}, indent=2))
-        return
-    print(f"{len(frames)} frames, stride {arguments.stride}; RPE over {arguments.delta} frames; one thread\n")
+    else:
+        print(f"{len(frames)} frames, stride {arguments.stride}; RPE over {arguments.delta} frames; one thread\n")
+        report(table)
+
+
+def spread(spent: list[float], label: str) -> dict[str, float]:
+    return {f"median_{label}": float(np.median(spent)), f"p95_{label}": float(np.percentile(spent, 95))}
+
+
+def report(table: list[dict[str, Any]]) -> None:
     print("| method | ATE cm | RPE cm | RPE deg | median ms | p95 ms | CPU median | CPU p95 | CPU / full |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for row in table:

@@ -19,31 +19,40 @@ class UndecodableError(ValueError):
     """A file that is damaged or cut short."""
 
 
-class ImageDecoder(Operator):
+class _Decoder(Operator, abstract=True):
+    """Holds what both operators share: a file that is damaged or cut short is passed over, and reported."""
+
+    stateless = True
+
+    max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
+
+    @cached_property
+    def _passed_over(self) -> PassedOver:
+        return PassedOver(self.log, strict=False)
+
+    def _reported(self, name: str, stamp: int, error: UndecodableError) -> Mapping[str, Message]:
+        """Reports a file on the status stream, and few of them in the log."""
+        self._passed_over.take(error)
+        return {"status": counted_status(name, stamp, f"passed over: {error}", Level.WARN, {})}
+
+
+class ImageDecoder(_Decoder):
     """Decodes JPEG, PNG or WebP files to images: grey files to grey images, all others to RGB.
 
     A file that is damaged or cut short is passed over, and reported. JPEG has no checksums: a file that is whole and
     has wrong bytes in the middle decodes to wrong pixels.
     """
 
-    stateless = True
-
     compressed: In[CompressedImage] = In(doc="the encoded file")
     image: Out[Image] = Out(doc="its pixels, of the same stamp and frame")
     status: Out[Diagnostics] = Out(doc="a warning for each file that cannot be decoded, with the reason")
-
-    max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
-
-    @cached_property
-    def _passed_over(self) -> _Reported:
-        return _Reported(self.log, strict=False)
 
     def process(self, compressed: CompressedImage) -> Mapping[str, Message]:
         """Raises ValueError for a file of more than `max_pixels`."""
         try:
             return {"image": self.decode(compressed)}
         except UndecodableError as error:
-            return {"status": self._passed_over.report("image_decoder", compressed.stamp, error)}
+            return self._reported("image_decoder", compressed.stamp, error)
 
     def decode(self, compressed: CompressedImage) -> Image:
         """Returns the image. Raises ValueError where the bytes are not a whole one."""
@@ -55,7 +64,7 @@ class ImageDecoder(Operator):
         return Image(stamp=compressed.stamp, frame=compressed.frame, data=pixels)
 
 
-class DepthDecoder(Operator):
+class DepthDecoder(_Decoder):
     """Decodes 16-bit PNG files to depth images in metres.
 
     The pixel value 0 is no return. Where the depths were multiples of the quantiser's step, as from a camera that
@@ -63,24 +72,16 @@ class DepthDecoder(Operator):
     short is passed over, and reported.
     """
 
-    stateless = True
-
     compressed: In[CompressedDepth] = In(doc="the encoded file and what its numbers mean")
     depth: Out[DepthImage] = Out(doc="metres, 0 for no return, of the same stamp and frame")
     status: Out[Diagnostics] = Out(doc="a warning for each file that cannot be decoded, with the reason")
-
-    max_pixels: int = Param(64_000_000, ge=1, tunable=True, doc="a file that decodes to more pixels is refused")
-
-    @cached_property
-    def _passed_over(self) -> _Reported:
-        return _Reported(self.log, strict=False)
 
     def process(self, compressed: CompressedDepth) -> Mapping[str, Message]:
         """Raises ValueError for a file of more than `max_pixels`."""
         try:
             return {"depth": self.decode(compressed)}
         except UndecodableError as error:
-            return {"status": self._passed_over.report("depth_decoder", compressed.stamp, error)}
+            return self._reported("depth_decoder", compressed.stamp, error)
 
     def decode(self, compressed: CompressedDepth) -> DepthImage:
         """Returns the depth image. Raises ValueError where the bytes are not a whole file of one."""
@@ -89,14 +90,6 @@ class DepthDecoder(Operator):
             levels.astype(np.uint16, copy=False), compressed.quantizer, compressed.scale, compressed.offset
         )
         return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
-
-
-class _Reported(PassedOver):
-    """Reports each file that is passed over on the status stream, and few of them in the log."""
-
-    def report(self, name: str, stamp: int, error: UndecodableError) -> Diagnostics:
-        self.take(error)
-        return counted_status(name, stamp, f"passed over: {error}", Level.WARN, {})
 
 
 def depth_in_metres(levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float) -> NDArray[np.float32]:

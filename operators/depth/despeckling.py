@@ -116,10 +116,7 @@ def _shifted(image: Depth, step: tuple[int, int], times: int) -> Depth:
     out = np.zeros_like(image)
     rows, columns = slice(max(0, -dv), min(height, height - dv)), slice(max(0, -du), min(width, width - du))
     if rows.start < rows.stop and columns.start < columns.stop:
-        out[rows, columns] = image[
-            rows.start + dv : rows.stop + dv,
-            columns.start + du : columns.stop + du,
-        ]
+        out[rows, columns] = image[rows.start + dv : rows.stop + dv, columns.start + du : columns.stop + du]
     return out
 
 

@@ -135,9 +135,7 @@ class MonoDepth(Operator):
         unit="px",
     )
     input_size: tuple[int, int] | None = Param(
-        None,
-        doc="(width, height) where the model leaves it open; none takes the registry's, or 518 x 518",
-        unit="px",
+        None, doc="(width, height) where the model leaves it open; none takes the registry's, or 518 x 518", unit="px"
     )
     align: Literal["scale_and_shift", "scale"] = Param(
         "scale_and_shift", doc="what is fitted to the given depths: the model's own constant is unknown, or is 0"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -64,17 +65,8 @@ class StereoDepth(Operator):
     def setup(self) -> None:
         """Raises ValueError for parameters that contradict each other."""
         self._check_range()
-        self._matcher = StereoMatcher(
-            MatchingConfig(
-                disparities=self.disparities,
-                block=self.block,
-                small_step=self.small_step,
-                large_step=self.large_step,
-                uniqueness=self.uniqueness,
-                speckle=self.speckle,
-                tolerance=self.tolerance,
-            )
-        )
+        settings = {field.name: getattr(self, field.name) for field in fields(MatchingConfig)}
+        self._matcher = StereoMatcher(MatchingConfig(**settings))
 
     def on_parameter(self, name: str) -> None:
         self._check_range()

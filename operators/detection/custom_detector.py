@@ -7,8 +7,8 @@ from typing import Any
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.custom.finder import GridFinder
-from operators.detection.messages import detections_of
+from operators.detection.custom.refiner import GridFinder
+from operators.detection.decode import detections_of
 from operators.network_input import three_channels
 from operators.weights import shipped, trained_in_simulation
 

@@ -1,4 +1,4 @@
-"""Candidates in the pixels of a network's input, boxes from rows: shared by the decoders of detector networks."""
+"""Candidates in the pixels of a network's input, boxes from rows, messages of both: shared by all decoders."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages import Detections2D, Image, pack_masks
 from operators.image.letterbox import Fit, FitMode
 
 Size = tuple[int, int]
@@ -65,6 +66,21 @@ class Layout:
     grid: int = 32
     words: int = 0
     names: tuple[str, ...] = ()
+
+
+def detections_of(image: Image, names: tuple[str, ...], found: Candidates) -> Detections2D:
+    """Returns boxes, scores, classes, and drawn masks where there are any, all in the image's pixels."""
+    return Detections2D(
+        stamp=image.stamp,
+        frame=image.frame,
+        width=image.width,
+        height=image.height,
+        class_names=names,
+        boxes=found.boxes,
+        scores=np.minimum(found.scores, np.float32(1)),
+        class_ids=found.classes,
+        masks=None if found.masks is None else pack_masks(found.masks.astype(np.bool_, copy=False)),
+    )
 
 
 def best_class(

@@ -140,9 +140,7 @@ class KeypointDetector(Operator):
     model: str = Param(min_length=1, doc="a name of `dataflow models list`, or an ONNX file")
     decoder: KeypointDecoderName | None = Param(None, doc="family of the network; none takes the registry's")
     input_size: tuple[int, int] | None = Param(
-        None,
-        doc="(width, height) where the model leaves it open; none takes the registry's, or 192 x 256",
-        unit="px",
+        None, doc="(width, height) where the model leaves it open; none takes the registry's, or 192 x 256", unit="px"
     )
     provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
     classes: tuple[str, ...] = Param(("person",), doc="names of the detections that have keypoints")

@@ -10,10 +10,10 @@ from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param, ParameterError
 from operators.cameras import Cameras
 from operators.detection.coco import names_of
-from operators.detection.custom.finder import GridFinder
+from operators.detection.custom.refiner import GridFinder
+from operators.detection.decode import detections_of
 from operators.detection.decoders import DecoderName
 from operators.detection.exported import ExportedFinder
-from operators.detection.messages import detections_of
 from operators.image.letterbox import FitMode
 from operators.inference import ModelError, Provider
 from operators.models.registry import Registry

@@ -97,13 +97,7 @@ class Window:
         """Returns the calibration of the window, of one of the image; distortion coefficients hold for both."""
         sx, sy = self.columns / self.width, self.rows / self.height
         # Pixels scale about the image's corner, which lies half a pixel before the first pixel's centre.
-        S = np.array(
-            [
-                [sx, 0, (0.5 - self.x) * sx - 0.5],
-                [0, sy, (0.5 - self.y) * sy - 0.5],
-                [0, 0, 1],
-            ]
-        )
+        S = np.array([[sx, 0, (0.5 - self.x) * sx - 0.5], [0, sy, (0.5 - self.y) * sy - 0.5], [0, 0, 1]])
         return info.replace(
             width=self.columns, height=self.rows, K=S @ info.K, P=None if info.P is None else S @ info.P
         )

@@ -31,9 +31,8 @@ def export_network(
     Weights are stored as float16 and widened when the file is loaded; arithmetic is float32. The file appears whole or
     not at all. `facts` must be plain values.
     """
-    still = copy.deepcopy(network).cpu().eval()
     examples = (torch.zeros(1, 3, size[1], size[0]),)
-    _write(_model(still, examples, ["image"], list(outputs), None, facts), file)
+    _write(_model(network, examples, ["image"], list(outputs), None, facts), file)
 
 
 def export_steps(network: nn.Module, examples: tuple[Tensor, ...], facts: Mapping[str, Any], file: Path) -> None:
@@ -44,8 +43,7 @@ def export_steps(network: nn.Module, examples: tuple[Tensor, ...], facts: Mappin
     rows = {"features": {0: "agents"}, "hidden": {1: "agents"}, "cell": {1: "agents"}}
     outputs = ["probabilities", "next_hidden", "next_cell"]
     given = {"probabilities": {0: "agents"}, "next_hidden": {1: "agents"}, "next_cell": {1: "agents"}}
-    still = copy.deepcopy(network).cpu().eval()
-    _write(_model(still, examples, list(rows), outputs, rows | given, facts), file)
+    _write(_model(network, examples, list(rows), outputs, rows | given, facts), file)
 
 
 def export_rows(
@@ -56,8 +54,7 @@ def export_rows(
     Weights are stored as those of `export_network`.
     """
     axes = {name: {0: "rows"} for name in (*examples, *outputs)}
-    still = copy.deepcopy(network).cpu().eval()
-    model = _model(still, tuple(examples.values()), list(examples), list(outputs), axes, facts)
+    model = _model(network, tuple(examples.values()), list(examples), list(outputs), axes, facts)
     _in_integers(model)
     _write(model, file)
 
@@ -102,7 +99,7 @@ def _model(
         # The exporter that needs no further package; its successor needs onnxscript.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network,
+            copy.deepcopy(network).cpu().eval(),
             examples,
             Path(folder) / "network.onnx",
             input_names=inputs,

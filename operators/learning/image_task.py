@@ -12,12 +12,14 @@ from operators.weights.network_file import TRAINED_ON
 
 
 class Labelled(Protocol):
-    """Class names and images to train on."""
+    """Class names, images to train on and images to score on."""
 
     @property
-    def classes(self) -> Sequence[str]: ...
+    def classes(self) -> tuple[str, ...]: ...
     @property
     def training(self) -> Sequence[Any]: ...
+    @property
+    def validation(self) -> Sequence[Any]: ...
 
 
 Data = TypeVar("Data", bound=Labelled)

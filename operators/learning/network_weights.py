@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,6 +19,9 @@ from torch import Tensor, nn
 
 from operators.learning.files import TrainingFileError
 from operators.weights.network_file import read_facts
+
+if TYPE_CHECKING:
+    from operators.learning.loop import Task
 
 MOST_IMAGES = 64
 """Images by which means and variances are measured."""
@@ -35,15 +38,7 @@ class _Folded:
     bias: NDArray[np.float32]
 
 
-class _Drawn(Protocol):
-    """A task from which training images can be drawn."""
-
-    @property
-    def samples(self) -> int: ...
-    def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Any, ...]: ...
-
-
-def sample_images(task: _Drawn) -> Tensor:
+def sample_images(task: Task) -> Tensor:
     """Images (N, 3, H, W) as a training sees them, at most `MOST_IMAGES` of all its samples, evenly chosen."""
     step = max(1, task.samples // MOST_IMAGES)
     chosen = list(range(0, task.samples, step))[:MOST_IMAGES]

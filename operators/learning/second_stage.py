@@ -6,7 +6,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -16,23 +16,12 @@ from torch import Tensor, nn
 from operators.learning.augmentation import Variation
 from operators.learning.export import export_rows, without_second
 from operators.learning.files import TrainingFileError
+from operators.learning.image_task import Labelled
 
 Image = TypeVar("Image")
-Shown = TypeVar("Shown", covariant=True)
 Batch = TypeVar("Batch")
 Columns = Sequence[NDArray[Any]]
 """Rows by column: arrays whose first axis is the row."""
-
-
-class Labelled(Protocol[Shown]):
-    """Class names, images to train on and images to score on."""
-
-    @property
-    def classes(self) -> tuple[str, ...]: ...
-    @property
-    def training(self) -> tuple[Shown, ...]: ...
-    @property
-    def validation(self) -> tuple[Shown, ...]: ...
 
 
 class SecondTask(ABC, Generic[Image, Batch]):
@@ -49,7 +38,7 @@ class SecondTask(ABC, Generic[Image, Batch]):
     network: nn.Module
 
     def __init__(
-        self, data: Labelled[Image], file: Path, known: tuple[str, ...], seed: int, variation: Variation | None
+        self, data: Labelled, file: Path, known: tuple[str, ...], seed: int, variation: Variation | None
     ) -> None:
         """Raises TrainingFileError where the first network has other classes than the data."""
         torch.manual_seed(seed)

@@ -143,19 +143,15 @@ def found_blocks(
     """The class of the nearest cell for each pixel, up to the end of the last block, and the blocks to look at."""
     height, width = pixels.shape[:2]
     columns, rows = -(-width // BLOCK), -(-height // BLOCK)
-    cells = [
-        np.clip(np.rint(np.arange(count * BLOCK) * scale + offset), 0, limit - 1).astype(np.intp)
-        for count, scale, offset, limit in zip(
-            (columns, rows), placed.scale, placed.offset, labels.shape[::-1], strict=True
-        )
-    ]
+    along = list(zip((columns, rows), placed.scale, placed.offset, labels.shape[::-1], strict=True))
+    cells, middles = (
+        [
+            np.clip(np.rint((np.arange(count * per) * step + first) * scale + offset), 0, limit - 1).astype(np.intp)
+            for count, scale, offset, limit in along
+        ]
+        for per, step, first in ((BLOCK, 1, 0), (1, BLOCK, (BLOCK - 1) / 2))
+    )
     coarse = labels.take(cells[0], axis=1).take(cells[1], axis=0)
-    middles = [
-        np.clip(np.rint((np.arange(count) * BLOCK + (BLOCK - 1) / 2) * scale + offset), 0, limit - 1).astype(np.intp)
-        for count, scale, offset, limit in zip(
-            (columns, rows), placed.scale, placed.offset, labels.shape[::-1], strict=True
-        )
-    ]
     reach = [int(np.ceil(BLOCK / 2 * scale)) for scale in placed.scale]
     kernel = np.ones((2 * reach[1] + 1, 2 * reach[0] + 1), np.uint8)
     mixed = cv2.erode(labels, kernel) != cv2.dilate(labels, kernel)
@@ -170,24 +166,14 @@ def found_blocks(
     j, i = row * (BLOCK // GRAIN), column * (BLOCK // GRAIN)
     preferences = (near[number[first], j, i].astype(np.float32) - near[number[second], j, i]) * np.float32(step)
     beyond = cv2.copyMakeBorder(
-        pixels,
-        AROUND,
-        AROUND + rows * BLOCK - height,
-        AROUND,
-        AROUND + columns * BLOCK - width,
-        cv2.BORDER_REPLICATE,
+        pixels, AROUND, AROUND + rows * BLOCK - height, AROUND, AROUND + columns * BLOCK - width, cv2.BORDER_REPLICATE
     )
     seen = sliding_window_view(beyond, (SEEN, SEEN, 3))[row * BLOCK, column * BLOCK, 0]
     return coarse, Blocks(np.stack([column, row], axis=1), first, second, seen, preferences)
 
 
 def _others(
-    scores: Pixels,
-    labels: Pixels,
-    best: Pixels,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
-    reach: list[int],
+    scores: Pixels, labels: Pixels, best: Pixels, y: NDArray[np.intp], x: NDArray[np.intp], reach: list[int]
 ) -> Pixels:
     """The class that the cells around each cell (y, x) prefer most to that cell's own."""
     height, width = labels.shape

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, origin_of, read_image, read_utf8
+from operators.learning.augmentation import NONE, Variation, fitted, recolored, varied, warp
 
 VOID = 255
 _MASKS = ("masks", "annotations", "labels")
@@ -41,6 +42,17 @@ class MaskedImage:
                 f"{classes - 1}), and 255 is void"
             )
         return pixels, mask
+
+    def view(
+        self, classes: int, size: tuple[int, int], variation: Variation, rng: np.random.Generator | None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """A random view of pixels and mask, of `size` (width, height); without `rng` as they are, fitted into it."""
+        pixels, mask = self.read(classes)
+        variation = NONE if rng is None else variation
+        rng = np.random.default_rng(0) if rng is None else rng
+        affine = varied(fitted((pixels.shape[1], pixels.shape[0]), size), size, variation, rng)
+        seen = warp(mask, affine, size, border=VOID, labels=True)
+        return recolored(warp(pixels, affine, size), variation, rng), seen
 
 
 @dataclass(frozen=True)
@@ -102,8 +114,5 @@ def _divided(folder: Path, names: tuple[str, ...], pairs: list[MaskedImage], see
     training = [p for p in pairs if p not in validation]
     if not training:
         training = validation
-        notes = (
-            *notes,
-            "all images are for validation: they are trained on too, so the score means little",
-        )
+        notes = (*notes, "all images are for validation: they are trained on too, so the score means little")
     return SegmentationData(names, tuple(training), tuple(validation), notes, origin_of(folder))

@@ -109,9 +109,7 @@ class OnnxSegmenter(Operator):
     bgr: bool = Param(False, doc="the network sees blue first")
     fit: FitMode | None = Param(None, doc="how the image fills the input; none takes the registry's, or stretch")
     input_size: tuple[int, int] | None = Param(
-        None,
-        doc="(width, height) where the model leaves it open; none takes the registry's, or 512 x 512",
-        unit="px",
+        None, doc="(width, height) where the model leaves it open; none takes the registry's, or 512 x 512", unit="px"
     )
     confidence_threshold: float = Param(0.0, ge=0, le=1, tunable=True, doc="pixels below become void")
     class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.learning.augmentation import Variation, tensor_of
 from operators.learning.backbone import BACKBONES, load_backbone
 from operators.learning.export import export_network
 from operators.learning.image_task import ImageTask
 from operators.learning.network_weights import begin_with, fitting_facts, sample_images
-from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
+from operators.segmentation.dataset import VOID, SegmentationData
 from operators.segmentation.network import WIDEST, DeployedSegmenter, ScoringSegmenter, SegmentationNetwork, enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.segmentation.scores import MOST_CLASSES
@@ -67,7 +66,10 @@ class SegmenterTask(ImageTask[SegmentationData]):
         return self._description(width=self.width, architecture=self.architecture)
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor]:
-        views = [self._view(self.data.training[k], rng) for k, rng in zip(samples, rngs, strict=True)]
+        views = [
+            self.data.training[k].view(len(self.data.classes), self.size, self.variation, rng)
+            for k, rng in zip(samples, rngs, strict=True)
+        ]
         images = np.stack([tensor_of(pixels) for pixels, _ in views])
         return torch.from_numpy(images), torch.from_numpy(np.stack([mask for _, mask in views]).astype(np.int64))
 
@@ -88,7 +90,7 @@ class SegmenterTask(ImageTask[SegmentationData]):
         classes = len(self.data.classes)
         table = np.zeros((classes, classes + 1), np.int64)
         for image in self.data.validation:
-            pixels, mask = self._view(image, None)
+            pixels, mask = image.view(len(self.data.classes), self.size, self.variation, None)
             with torch.inference_mode():
                 scores = network(torch.from_numpy(tensor_of(pixels))[None].to(device))
                 scores = enlarged(scores, mask.shape)
@@ -111,21 +113,11 @@ class SegmenterTask(ImageTask[SegmentationData]):
         """A step of scores in 8 bits such that the widest gap in a few images takes 255, but not beyond `WIDEST`."""
         device, widest = next(network.parameters()).device, 0.0
         for image in self.data.validation[:_MEASURED]:
-            pixels, _ = self._view(image, None)
+            pixels, _ = image.view(len(self.data.classes), self.size, self.variation, None)
             with torch.inference_mode():
                 scores = network(torch.from_numpy(tensor_of(pixels))[None].to(device))
             widest = max(widest, float((scores.amax(dim=1) - scores.amin(dim=1)).max()))
         return min(WIDEST, max(widest, 1e-3) / 255)
-
-    def _view(self, image: MaskedImage, rng: np.random.Generator | None) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """A random view of an image and its mask; as it is, fitted into the input, without `rng`."""
-        pixels, mask = image.read(len(self.data.classes))
-        affine = fitted((pixels.shape[1], pixels.shape[0]), self.size)
-        variation = self.variation if rng is not None else NONE
-        rng = rng or np.random.default_rng(0)
-        affine = varied(affine, self.size, variation, rng)
-        seen = warp(mask, affine, self.size, border=VOID, labels=True)
-        return recolored(warp(pixels, affine, self.size), variation, rng), seen
 
 
 def class_weights(data: SegmentationData, most: int = 200) -> Tensor:

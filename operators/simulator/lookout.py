@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import transform_points
+from operators.simulator.maps import mesh
 from operators.simulator.rendering.native import open3d
 from operators.simulator.scene import World
 from operators.simulator.settings import ColorCamera
@@ -79,20 +79,9 @@ def _in_view(offsets: Array, heading: float, pitch: float, camera: ColorCamera) 
 
 def _free(world: World, eyes: Array, offsets: Array) -> NDArray[np.bool_]:
     """Returns which points (P, M), given from each eye (P, 3), nothing that stands still hides."""
-    native = open3d()
-    vertices, triangles, count = [], [], 0
-    for thing in world.things:
-        if thing.still:
-            for patch in thing.parts[0]:
-                vertices.append(transform_points(thing.mover.frame(0.0), patch.vertices))
-                triangles.append(patch.triangles + count)
-                count += len(patch.vertices)
-    scene = native.t.geometry.RaycastingScene(nthreads=1)
-    core = native.core
-    scene.add_triangles(
-        core.Tensor(np.concatenate(vertices).astype(np.float32)),
-        core.Tensor(np.concatenate(triangles).astype(np.uint32)),
-    )
+    native, still = open3d(), mesh(world, 0, "world")
+    scene, core = native.t.geometry.RaycastingScene(nthreads=1), native.core
+    scene.add_triangles(core.Tensor(still.vertices), core.Tensor(still.triangles))
     rays = np.empty((*offsets.shape[:2], 6), np.float32)
     rays[..., :3] = eyes[:, None]
     rays[..., 3:] = offsets

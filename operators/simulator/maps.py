@@ -25,7 +25,7 @@ def occupancy(world: World, resolution: float, band: tuple[float, float], stamp:
     free where the robot can get to from its start by steps to free neighbours, and unknown elsewhere: outside, and
     within furniture. The grid has a margin of one cell about the building.
     """
-    low, high = (np.array(corner[:2]) for corner in _floor(world))
+    low, high = (np.array(corner[:2]) for corner in floor_of(world))
     origin = np.floor(low / resolution) * resolution - resolution
     columns, rows = np.ceil((high - origin) / resolution).astype(int) + 1
     taken = np.zeros((rows, columns), np.bool_)
@@ -44,11 +44,7 @@ def occupancy(world: World, resolution: float, band: tuple[float, float], stamp:
     cells = np.where(parts == parts[row, column], FREE, UNSEEN)
     cells[taken] = TAKEN
     return OccupancyGrid(
-        stamp=stamp,
-        frame=frame,
-        resolution=resolution,
-        cells=cells.astype(np.int8),
-        position=np.array([*origin, 0.0]),
+        stamp=stamp, frame=frame, resolution=resolution, cells=cells.astype(np.int8), position=np.array([*origin, 0.0])
     )
 
 
@@ -89,7 +85,7 @@ def mesh(world: World, stamp: int, frame: str) -> Mesh:
     )
 
 
-def _floor(world: World) -> tuple[Array, Array]:
+def floor_of(world: World) -> tuple[Array, Array]:
     """Lowest and highest corner of the floor."""
     corners = np.concatenate([thing.vertices(0.0) for thing in world.things if thing.label == "floor"])
     return corners.min(axis=0), corners.max(axis=0)

@@ -205,12 +205,12 @@ class SimulatedRobot(Source):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         self._rig, self._last = self._new_rig(), dict[str, Messages]()
-        measured, told = self._measures(), self._truths()
+        told = self._truths()
         for stamp, together in merged(self._schedule()):
             messages: Messages = {}
             for tick in together:
-                if tick.sensor in measured:
-                    messages |= self._measured(*measured[tick.sensor], tick)
+                if tick.sensor in _PARAMETERS:
+                    messages |= self._measured(_PARAMETERS[tick.sensor], tick)
                 else:
                     messages |= told[tick.sensor]((tick.stamp - self.first_stamp) * 1e-9, tick)
             if messages:
@@ -220,22 +220,6 @@ class SimulatedRobot(Source):
     def length(self) -> int | None:
         """An upper bound: drop-outs may leave a stamp without messages."""
         return sum(1 for _ in merged(self._schedule()))
-
-    def _measures(self) -> dict[str, tuple[str, Callable[..., Messages]]]:
-        """Returns what measures, and the parameter that has its settings."""
-        rig = self._rig
-        return {
-            "color": ("color_camera", rig.color),
-            "depth": ("depth_camera", rig.depth),
-            "stereo": ("stereo", rig.stereo),
-            "lidar": ("lidar", rig.lidar),
-            "imu": ("inertial", rig.imu),
-            "magnetometer": ("magnetometer", rig.magnetometer),
-            "wheels": ("wheels", rig.wheels),
-            "radar": ("radar", rig.radar),
-            "landmarks": ("landmarks", rig.landmarks),
-            "gnss": ("gnss", rig.gnss),
-        }
 
     def _truths(self) -> dict[str, Callable[[float, Tick], Messages]]:
         return {
@@ -249,7 +233,7 @@ class SimulatedRobot(Source):
         start, end, truth = self.first_stamp, self.first_stamp + self.duration, self.truth
         streams = {
             name: ticks(name, sensor.rate, start + sensor.phase, end)
-            for name, (parameter, _) in self._measures().items()
+            for name, parameter in _PARAMETERS.items()
             for sensor in [getattr(self, parameter)]
         }
         for name in ("poses", "activities", "relations"):
@@ -259,7 +243,7 @@ class SimulatedRobot(Source):
             streams["events"] = ticks_at("events", [start + round(t * 1e9) for t in sorted(times)], end)
         return streams
 
-    def _measured(self, parameter: str, measure: Callable[..., Messages], tick: Tick) -> Messages:
+    def _measured(self, parameter: str, tick: Tick) -> Messages:
         """Returns what a sensor emits at a tick; truth about an image comes also where the image is missing."""
         rng = generator(self.seed, tick.sensor, tick.index)
         elapsed = (tick.stamp - self.first_stamp) * 1e-9
@@ -267,7 +251,7 @@ class SimulatedRobot(Source):
         sensor = self._faults.at(parameter, given, elapsed)
         missing = rng.random() < sensor.dropout or any(a <= elapsed < b for a, b in sensor.outages)
         age = sensor.delay * 1e-9 + sensor.clock_drift * elapsed
-        messages: Messages = measure(sensor, max(0.0, elapsed - age), tick, rng)
+        messages: Messages = self._rig.measures[parameter](sensor, max(0.0, elapsed - age), tick, rng)
         if missing:
             return {k: m for k, m in messages.items() if k in _TRUTH}
         last = self._last.get(tick.sensor)
@@ -305,3 +289,6 @@ class SimulatedRobot(Source):
 
 
 _TRUTH = {"objects", "boxes", "masks"}
+_NAMES = {"color_camera": "color", "depth_camera": "depth", "inertial": "imu"}
+_PARAMETERS = {_NAMES.get(name, name): name for name in SENSORS}
+"""Parameters of the sensors by the names of their ticks, from which their random numbers are drawn."""

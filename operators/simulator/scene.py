@@ -1,19 +1,29 @@
-"""Parts of a world: things with shape and pose, lights, landmarks, the robot's path, and who rests on what."""
+"""Parts of a world: things with shape and pose, lights, landmarks, the robot's path, who rests on what, and lanes.
+
+Lanes are strips of floor that movers keep to. Lanes apart keep movers apart at all times, whatever their phases.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dataflow.messages.geometry import invert, transform_points
-from operators.simulator.lanes import Lane
+from operators.simulator.settings import Mount
 from operators.simulator.shapes import Array, Shape, bounds
 from operators.simulator.trajectory import Trajectory
+
+WALKER, ROVER = 0.38, 0.31
+"""Metres from its way within which a person walks, turns and swings the arms, and a robot drives."""
+
+_SPACING = 0.02  # metres between the points that stand for a line
 
 
 class Mover(Protocol):
@@ -124,6 +134,44 @@ class Placement:
     holds: Callable[[float], bool] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """All within `radius` metres of a line (N, 2), for the thing with id `mover`."""
+
+    mover: int
+    line: Array
+    radius: float
+
+    def gap(self, points: Array) -> float:
+        """Metres between the lane and the nearest of points (M, 2); negative if that is inside."""
+        return float(np.min(self._off_line(points))) - self.radius
+
+    def holds(self, points: Array) -> bool:
+        """Returns whether all of the points (M, 2) lie in the lane, to within a centimetre."""
+        return bool(np.max(self._off_line(points)) <= self.radius + _SPACING / 2)
+
+    def apart(self, other: Lane) -> float:
+        """Metres between two lanes; negative if they overlap."""
+        return self.gap(_dense(other.line)) - other.radius
+
+    def _off_line(self, points: Array) -> Array:
+        """Metres (M,) to the line."""
+        distance, _ = self._tree.query(points)
+        return np.asarray(distance)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(_dense(self.line))
+
+
+def _dense(line: Array) -> Array:
+    """Points at most `_SPACING` apart along straight pieces."""
+    pieces = [
+        np.linspace(a, b, max(1, int(np.linalg.norm(b - a) / _SPACING)), endpoint=False) for a, b in pairwise(line)
+    ]
+    return np.concatenate([*pieces, line[-1:]])
+
+
 @dataclass(frozen=True)
 class Order:
     """Holds what is asked of a world.
@@ -164,7 +212,7 @@ class World:
     ambient: float
     path: Trajectory
     landmarks: NDArray[np.float64]
-    camera_mount: tuple[float, float, float, float, float, float]
+    camera_mount: Mount
     placements: tuple[Placement, ...]
     scripts: tuple[Callable[[float], Doing], ...] = ()
     floor_id: int = 0
@@ -184,10 +232,10 @@ class World:
 
     def thing(self, id: int) -> Thing:
         """Raises KeyError for an id that is not in the world."""
-        for thing in self.things:
-            if thing.id == id and id:
-                return thing
-        raise KeyError(f"no thing {id} in world {self.name!r}")
+        found = next((thing for thing in self.things if thing.id == id and id), None)
+        if found is None:
+            raise KeyError(f"no thing {id} in world {self.name!r}")
+        return found
 
     def objects(self) -> Sequence[Thing]:
         """The things that have an identity."""
@@ -207,6 +255,16 @@ class Builder:
     def surface(self, label: str, shape: Shape) -> None:
         """A piece of the building, given in world coordinates."""
         self.things.append(Thing(0, label, (shape,), Still(np.eye(4))))
+
+    def world(
+        self, name: str, lights: Sequence[Light], ambient: float, path: Trajectory, landmarks: Array, mount: Mount,
+        **looks: Any,
+    ) -> World:  # fmt: skip
+        """All that was collected, as a world."""
+        return World(
+            name, tuple(self.things), tuple(lights), ambient, path, landmarks, mount, tuple(self.placements),
+            tuple(self.scripts), lanes=tuple(self.lanes), **looks,
+        )  # fmt: skip
 
     def new_id(self) -> int:
         self._next += 1

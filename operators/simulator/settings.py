@@ -229,6 +229,10 @@ class Gnss(Placed):
     )
 
 
+Mounted = Lidar | Inertial | Magnetometer | Radar | Landmarks | Gnss
+"""Sensors with a separate mount."""
+
+
 @dataclass(frozen=True)
 class Sensors:
     """All sensors of the robot."""
@@ -244,7 +248,7 @@ class Sensors:
     landmarks: Landmarks
     gnss: Gnss
 
-    def mounted(self) -> dict[str, Lidar | Inertial | Magnetometer | Radar | Landmarks | Gnss]:
+    def mounted(self) -> dict[str, Mounted]:
         """Those with a separate mount, by frame."""
         return {
             "lidar": self.lidar,

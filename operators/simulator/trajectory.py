@@ -79,7 +79,7 @@ class Trajectory:
         velocity = self._curve[1](around[:-1])
         heading = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
         closing = math.atan2(velocity[0, 1], velocity[0, 0])
-        heading = np.append(heading, heading[-1] + _wrap(closing - heading[-1]))
+        heading = np.append(heading, heading[-1] + wrapped(closing - heading[-1]))
         self._coarse_times, self._coarse_heading = around, heading
 
     def at(self, times: ArrayLike) -> Motion:
@@ -155,5 +155,6 @@ def _timed(points: Array, speed: float, turn_rate: float) -> tuple[Array, Array]
     return p, times
 
 
-def _wrap(angle: float) -> float:
+def wrapped(angle: float) -> float:
+    """Returns an angle within half a turn of 0."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -12,6 +12,7 @@ from dataflow.messages.geometry import matrix_to_quaternion
 from operators.simulator.classes import ACTIVITIES, ACTIVITY_IDS, CLASS_IDS, CLASSES, THINGS, VOID
 from operators.simulator.drive import Drive
 from operators.simulator.events import Change
+from operators.simulator.maps import floor_of
 from operators.simulator.relations import Nearness, spatial
 from operators.simulator.rendering.optics import Optics, View
 from operators.simulator.rendering.renderer import Renderer
@@ -159,9 +160,7 @@ class TrueGraph:
         self._world = world
         self._things = list(world.objects())
         self._nearness = Nearness(self._things) if with_spatial else None
-        floors = [thing for thing in world.things if thing.label == "floor"]
-        corners = np.concatenate([thing.vertices(0.0) for thing in floors])
-        self._floor = corners.min(axis=0), corners.max(axis=0)
+        self._floor = floor_of(world)
 
     def at(self, t: float, T_world_base: Array, stamp: int, frame: str) -> SceneGraph:
         world = self._world

@@ -17,7 +17,7 @@ import numpy as np
 
 from dataflow.messages import Message
 from dataflow.operator import Duration, Param, SourceError
-from operators.passed_over import TRIED, PassedOver
+from operators.passed_over import PassedOver
 from operators.sources.pacing import frame_stamp
 from operators.sources.video import CalibratedImages, Pixels
 
@@ -62,17 +62,7 @@ class ImageFolder(CalibratedImages):
             raise SourceError(f"{self._folder} has no image whose name is {self.pattern!r}")
         if self._files[0].stamp < 0:
             raise SourceError(f"{self._folder / self._files[0].name} has no number: `stamps: file_time` needs none")
-        self._calibrate(self._first_image())
-
-    def _first_image(self) -> Pixels:
-        refused: SourceError | None = None
-        for file in self._files[: 1 if self.strict else TRIED]:
-            try:
-                return self._read(file)
-            except SourceError as error:
-                refused = refused or error
-        assert refused is not None
-        raise refused
+        self._calibrate(self._passed.first(self._files, self._read))
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         last = -1

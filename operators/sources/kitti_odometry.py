@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages import CameraInfo, Image, Message, Pose
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
-from operators.passed_over import TRIED, PassedOver
+from operators.passed_over import PassedOver
 from operators.sources.pacing import frame_stamp
 
 Array = NDArray[np.float64]
@@ -64,31 +64,14 @@ class KittiOdometry(Source):
         self._poses = poses[self.start : self.stop]
         if poses and len(self._poses) < len(self._pairs):
             raise SourceError(f"{truth} has {len(poses)} poses, and there are more images")
-        self._size = self._first_size()
-
-    def _first_size(self) -> tuple[int, ...]:
-        refused: SourceError | None = None
-        for left, _ in self._pairs[: 1 if self.strict else TRIED]:
-            try:
-                return self._read(left).shape[1::-1]
-            except SourceError as error:
-                refused = refused or error
-        assert refused is not None
-        raise refused
+        self._size = self._passed.first(self._pairs, lambda pair: self._read(pair[0])).shape[1::-1]
 
     def static_outputs(self) -> Mapping[str, Message]:
-        frames = (self.left_frame, self.right_frame)
-        names = ("left_info", "right_info")
+        stamp, (width, height) = frame_stamp(self.start, self.rate, self.first_stamp), self._size
+        frames = {"left_info": self.left_frame, "right_info": self.right_frame}
         return {
-            name: CameraInfo(
-                stamp=frame_stamp(self.start, self.rate, self.first_stamp),
-                frame=frame,
-                width=self._size[0],
-                height=self._size[1],
-                K=P[:, :3],
-                P=P,
-            )
-            for name, frame, P in zip(names, frames, self._P, strict=True)
+            name: CameraInfo(stamp=stamp, frame=frame, width=width, height=height, K=P[:, :3], P=P)
+            for (name, frame), P in zip(frames.items(), self._P, strict=True)
         }
 
     def stream(self) -> Iterator[Mapping[str, Message]]:

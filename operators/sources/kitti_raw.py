@@ -14,7 +14,7 @@ from dataflow.messages import CameraInfo, Image, Imu, Message, NavSatFix, Odomet
 from dataflow.messages.geometry import invert
 from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
-from operators.passed_over import TRIED, PassedOver
+from operators.passed_over import PassedOver
 from operators.sources.kitti_files import Numbers, calibration_files, files_in, read_stamps
 from operators.sources.kitti_oxts import messages_of, read_packet
 
@@ -95,19 +95,10 @@ class KittiRaw(Source):
         self._packets = self._chosen_packets(folder, times)
         files = calibration_files(folder)
         self._calibration = read_calibration(*(self.use_file(file) for file in files))
-        self._size = self._first_size()
+        images_read = (image for image, _ in self._frames.values())
+        self._size = self._passed.first(images_read, _read_image).shape[:2]
         mounting = next((h / _IMU for h in (folder, folder.parent) if (h / _IMU).is_file()), None)
         self._mounting = None if mounting is None else read_mounting(self.use_file(mounting))
-
-    def _first_size(self) -> tuple[int, ...]:
-        refused: SourceError | None = None
-        for image, _ in list(self._frames.values())[: 1 if self.strict else TRIED]:
-            try:
-                return _read_image(image).shape[:2]
-            except SourceError as error:
-                refused = refused or error
-        assert refused is not None
-        raise refused
 
     def _chosen_packets(self, folder: Path, times: Mapping[str, int]) -> dict[int, Path]:
         """The packets by stamp, from the first to the last frame; those before and after, where all frames are read."""

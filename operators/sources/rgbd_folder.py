@@ -15,16 +15,8 @@ from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Tran
 from dataflow.messages.depth_units import FIFTHS, INVALID, MILLIMETRES, DepthSpan
 from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source, SourceError
-from operators.passed_over import TRIED, PassedOver
-from operators.sources.rgbd_layouts import (
-    Dataset,
-    Frame,
-    Intrinsics,
-    Place,
-    detect_layout,
-    list_7scenes,
-    list_tum,
-)
+from operators.passed_over import PassedOver
+from operators.sources.rgbd_layouts import Frame, Intrinsics, Place, detect_layout, list_7scenes, list_tum
 
 Size = tuple[int, int]
 
@@ -108,7 +100,8 @@ class RgbdFolder(Source):
             raise SourceError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
         folder = Path(self.path).expanduser()
         self._passed = PassedOver(self.log, strict=self.strict)
-        self._dataset = self._list(folder)
+        layout = detect_layout(folder) if self.layout == "auto" else self.layout
+        self._dataset = list_tum(folder) if layout == "tum" else list_7scenes(folder, self.rate, self.first_stamp)
         for reason in self._dataset.lacking:
             self._passed.take(SourceError(reason))
         self._frames = [f for f in self._dataset.frames[self.start : self.stop : self.stride] if self._is_there(f)]
@@ -119,7 +112,9 @@ class RgbdFolder(Source):
             )
         if (folder / "camera-intrinsics.txt").is_file():
             self.use_file(folder / "camera-intrinsics.txt")
-        self._image_size, self._depth_size = self._sizes()
+        self._image_size, self._depth_size = self._passed.first(
+            self._frames, lambda frame: (_size(read_color(frame)), _size(read_depth(frame)))
+        )
         self._place = self._placed()
         self._image_camera, self._depth_camera = self._cameras()
         self._scale = self._dataset.depth_scale if self.depth_scale is None else self.depth_scale
@@ -131,17 +126,6 @@ class RgbdFolder(Source):
         if missing is not None:
             self._passed.take(SourceError(f"frame {frame.name}: no file {missing}"))
         return missing is None
-
-    def _sizes(self) -> tuple[Size, Size]:
-        """Those of the first frame that can be read."""
-        refused: SourceError | None = None
-        for frame in self._frames[: 1 if self.strict else TRIED]:
-            try:
-                return _size(read_color(frame)), _size(read_depth(frame))
-            except SourceError as error:
-                refused = refused or error
-        assert refused is not None
-        raise refused
 
     def static_outputs(self) -> Mapping[str, Message]:
         stamp = self._frames[0].stamp
@@ -175,19 +159,16 @@ class RgbdFolder(Source):
                 "image": Image(stamp=frame.stamp, frame=self.image_frame, data=color),
                 "depth": DepthImage(stamp=frame.stamp, frame=self.depth_frame, data=depth),
             }
-            T = self._truth(frame)
+            try:
+                T = frame.T_world_camera()
+            except SourceError as error:
+                self._passed.take(error)
+                T = None
             if T is not None:
                 messages["ground_truth"] = Pose.from_matrix(
                     T, stamp=frame.stamp, frame=self.world_frame, child_frame=self.depth_frame
                 )
             yield messages
-
-    def _truth(self, frame: Frame) -> NDArray[np.float64] | None:
-        try:
-            return frame.T_world_camera()
-        except SourceError as error:
-            self._passed.take(error)
-            return None
 
     def length(self) -> int | None:
         return len(self._frames) if hasattr(self, "_frames") else None
@@ -195,12 +176,6 @@ class RgbdFolder(Source):
     def summary(self) -> Mapping[str, int]:
         unpaired = {"without_depth": self._dataset.unpaired} if self._dataset.unpaired else {}
         return {"passed_over": self._passed.number, **unpaired}
-
-    def _list(self, folder: Path) -> Dataset:
-        layout = detect_layout(folder) if self.layout == "auto" else self.layout
-        if layout == "tum":
-            return list_tum(folder)
-        return list_7scenes(folder, self.rate, self.first_stamp)
 
     @property
     def _registered(self) -> bool:
@@ -222,15 +197,16 @@ class RgbdFolder(Source):
         """Those of colour and of depth, which are one where depth is registered."""
         data = self._dataset
         if not self._registered or (self.image_intrinsics and self.depth_intrinsics):
-            image = _camera(self.image_intrinsics, data.image_intrinsics)
-            return image, _camera(self.depth_intrinsics, data.depth_intrinsics)
+            image = Intrinsics(*self.image_intrinsics) if self.image_intrinsics else data.image_intrinsics
+            return image, Intrinsics(*self.depth_intrinsics) if self.depth_intrinsics else data.depth_intrinsics
         if self._image_size != self._depth_size:
             raise SourceError(
                 f"{self.path}: depth is registered to colour, but its images have {_pixels(self._depth_size)} pixels "
                 f"and those of colour {_pixels(self._image_size)}: give registered: false and T_depth_image, or the "
                 "image_intrinsics and depth_intrinsics of these sizes"
             )
-        camera = _camera(self.image_intrinsics or self.depth_intrinsics, data.depth_intrinsics)
+        given = self.image_intrinsics or self.depth_intrinsics
+        camera = Intrinsics(*given) if given else data.depth_intrinsics
         return camera, camera
 
     def _probed(self, own: float) -> float:
@@ -318,10 +294,6 @@ def _pixels(size: Size) -> str:
 
 def _size(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> Size:
     return pixels.shape[1], pixels.shape[0]
-
-
-def _camera(given: tuple[float, float, float, float] | None, default: Intrinsics) -> Intrinsics:
-    return default if given is None else Intrinsics(*given)
 
 
 def _info(stamp: int, frame: str, size: Size, camera: Intrinsics) -> CameraInfo:

@@ -12,20 +12,11 @@ from rich.table import Table
 
 from operators.training.console import Data, Json, SplitSeed, friendly, out_console, score_words
 from operators.training.evaluation import evaluate
-from operators.training.options import (
-    Backbone,
-    Frozen,
-    ImageTraining,
-    Initial,
-    Size,
-    Width,
-    takes,
-)
+from operators.training.options import Backbone, Frozen, ImageTraining, Initial, Size, Width, takes
 from operators.training.people_commands import train_activity, train_posture
 from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerEpochs, command_of, train_second
 from operators.training.running import input_size, prepare, report, tell_data
 from operators.training.torchvision_command import train_torchvision
-from operators.training.trunk_command import train_trunk
 
 __all__ = ["evaluate", "train"]
 
@@ -44,7 +35,6 @@ train = typer.Typer(
 train.command("activity")(train_activity)
 train.command("posture")(train_posture)
 train.command("torchvision")(train_torchvision)
-train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 
@@ -231,6 +221,35 @@ def train_pair(
         options.json,
         seconds=seconds,
     )
+
+
+@train.command("trunk")
+def train_trunk(
+    first: Annotated[
+        Path, typer.Argument(help="A network file in 8 bits, which answers as before.", show_default=False)
+    ],
+    second: Annotated[Path, typer.Argument(help="Another one, which takes over its trunk.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="The folder to write both to.")] = Path("networks"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+) -> None:
+    """Give two networks in 8 bits one trunk: those of `dataflow train pair`, each quantized.
+
+    Operators in one process then compute it once for an image.
+
+    Examples:
+
+      dataflow train trunk out/detector.int8.onnx out/segmenter.int8.onnx --out out/networks
+    """
+    with friendly():
+        outs = (out / first.name, out / second.name)
+        there = [each for each in outs if each.exists() and not overwrite]
+        if there:
+            raise FileExistsError(f"{there[0]} exists already: give --overwrite or another --out")
+        from operators.training.trunk import share_trunk
+
+        out.mkdir(parents=True, exist_ok=True)
+        share_trunk(first, second, *outs)
+    out_console.print(f"{escape(str(outs[0]))} and {escape(str(outs[1]))} have one trunk")
 
 
 @train.command("quantize")

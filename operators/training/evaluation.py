@@ -33,11 +33,7 @@ evaluate.command("graph")(evaluate_graph)
 
 @evaluate.command("detector")
 def evaluate_detector(
-    data: Data,
-    weights: Weights,
-    everything: Everything = False,
-    seed: SplitSeed = None,
-    json: Json = False,
+    data: Data, weights: Weights, everything: Everything = False, seed: SplitSeed = None, json: Json = False
 ) -> None:
     """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format.
 
@@ -57,11 +53,7 @@ def evaluate_detector(
 
 @evaluate.command("segmenter")
 def evaluate_segmenter(
-    data: Data,
-    weights: Weights,
-    everything: Everything = False,
-    seed: SplitSeed = None,
-    json: Json = False,
+    data: Data, weights: Weights, everything: Everything = False, seed: SplitSeed = None, json: Json = False
 ) -> None:
     """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt.
 

@@ -7,11 +7,9 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from operators.training.console import Json, err_console
@@ -68,28 +66,10 @@ Bfloat16 = Annotated[
 
 
 class TrainingBar:
-    """A progress bar over all steps; a line for each epoch stays on the screen. Use it as a context manager."""
+    """Shows all steps in a progress bar; a line for each epoch stays on the screen."""
 
-    def __init__(self, console: Console) -> None:
-        self._bar = Progress(
-            TextColumn("epoch {task.fields[epoch]}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[losses]}"),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-        )
-        self._mean: dict[str, float] = {}
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
+    def __init__(self, bar: Progress) -> None:
+        self._bar, self._mean = bar, dict[str, float]()
 
     def begin(self, epochs: int, steps: int, done: int) -> None:
         self._epochs = epochs
@@ -148,8 +128,10 @@ class Training:
 
         if self.json:
             return train(task, self.settings, out, resume=self.resume)
-        with TrainingBar(err_console) as bar:
-            return train(task, self.settings, out, resume=self.resume, progress=bar)
+        losses, left = TextColumn("{task.fields[losses]}"), TimeRemainingColumn()
+        columns = TextColumn("epoch {task.fields[epoch]}"), BarColumn(), MofNCompleteColumn(), losses, left
+        with Progress(*columns, console=err_console, transient=True) as bar:
+            return train(task, self.settings, out, resume=self.resume, progress=TrainingBar(bar))
 
 
 @dataclass(frozen=True, kw_only=True)

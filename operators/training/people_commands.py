@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.progress import track
@@ -12,9 +12,6 @@ from rich.progress import track
 from operators.training.console import err_console, friendly
 from operators.training.options import Training, takes
 from operators.training.running import report
-
-if TYPE_CHECKING:
-    from operators.recognition.activity.episodes import Episode
 
 Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
 Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
@@ -60,12 +57,15 @@ def train_activity(
         options.keep_earlier(out)
         from operators.recognition.activity.sensed_people import read_tracks
         from operators.recognition.activity.training import ActivityTask
+        from operators.training import made_worlds
+        from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, write_episodes
 
-        training, choosing = _episodes(data, worlds, validation, processes, options.json)
-        parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
+        parts = made_worlds.worlds(TRAINING, worlds), made_worlds.worlds(VALIDATION, validation)
+        _followed(write_episodes(data, [*parts[0], *parts[1]], processes), worlds + validation, options.json)
+        tracks = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
         task = ActivityTask(
-            training, choosing, sensed=parts[0], sensed_validation=parts[1], repeats=repeats, seed=options.seed,
-            variations=variations,
+            *(read_episodes(data, part) for part in parts), sensed=tracks[0], sensed_validation=tracks[1],
+            repeats=repeats, seed=options.seed, variations=variations,
         )  # fmt: skip
         _tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", options.json)
         outcome = options.run(task, out)
@@ -108,19 +108,6 @@ def train_posture(
         )
         outcome = options.run(task, out)
     report(outcome, "operators.recognition:PostureRecognizer", options.json)
-
-
-def _episodes(
-    folder: Path, training: int, validation: int, processes: int, quiet: bool
-) -> tuple[list[Episode], list[Episode]]:
-    """Makes the episodes that a folder lacks, and reads all."""
-    from operators.training.made_worlds import worlds
-    from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, write_episodes
-
-    parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
-    made = write_episodes(folder, [*parts[0], *parts[1]], processes)
-    _followed(made, training + validation, quiet)
-    return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
 
 
 def _followed(made: Iterator[int], total: int, quiet: bool) -> None:

@@ -6,7 +6,7 @@ import json as jsonlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
@@ -14,25 +14,22 @@ from rich.markup import escape
 from operators.training.console import err_console, out_console, print_notes, score_words
 
 if TYPE_CHECKING:
-    from torch import nn
-
-    from operators.learning.backbone import Backbone as Extractor
+    from operators.detection.custom.dataset import DetectionData
+    from operators.detection.custom.training import DetectorTask
     from operators.learning.loop import Outcome
+    from operators.recognition.dataset import ClassificationData
+    from operators.segmentation.dataset import SegmentationData
+    from operators.segmentation.training import SegmenterTask
+    from operators.training.pair import PairTask
+
+    Read = DetectionData | SegmentationData | ClassificationData
 
 _LONGEST_SIDE, _MULTIPLE = 384, 32
 
 
-class FineTuned(Protocol):
-    """A task that can begin with the weights of another training."""
-
-    @property
-    def network(self) -> nn.Module: ...
-    @property
-    def backbone(self) -> Extractor: ...
-    def begin_with(self, file: Path) -> None: ...
-
-
-def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, initial: Path | None) -> None:
+def prepare(
+    task: DetectorTask | SegmenterTask | PairTask, weights: Path | None, frozen_stride: int | None, initial: Path | None
+) -> None:
     """Gives a network its first weights and freezes the part of the backbone that came with them."""
     from operators.learning.backbone import start_from
 
@@ -42,19 +39,6 @@ def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, in
         start_from(task.network, initial)
     given = weights is not None or initial is not None
     task.backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
-
-
-class Read(Protocol):
-    """Data that were read from a folder."""
-
-    @property
-    def notes(self) -> Sequence[str]: ...
-    @property
-    def training(self) -> Sequence[Any]: ...
-    @property
-    def validation(self) -> Sequence[Any]: ...
-    @property
-    def classes(self) -> Sequence[str]: ...
 
 
 def tell_data(read: Read, size: tuple[int, int], quiet: bool, classes: Sequence[str] | None = None) -> None:

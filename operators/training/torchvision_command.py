@@ -12,7 +12,7 @@ from operators.training.options import ImageTraining, takes
 from operators.training.running import input_size, report, tell_data
 
 if TYPE_CHECKING:
-    from operators.training.torchvision_tasks import TorchvisionDetectorTask, TorchvisionSegmenterTask
+    from operators.training.running import Read
 
 
 @takes(ImageTraining, epochs=20)
@@ -50,10 +50,22 @@ def train_torchvision(
         if weights is not None and initial is not None:
             raise ValueError("give either --weights or --from: both are what to begin with")
         from operators.torch_models import cached_weights, family_of
-        from operators.training.torchvision_tasks import weights_in
+        from operators.training.torchvision_tasks import TorchvisionDetectorTask, TorchvisionSegmenterTask, weights_in
 
         detects = family_of(name) == "detection"
-        task = (_detector if detects else _segmenter)(name, data, size, options)
+        task: TorchvisionDetectorTask | TorchvisionSegmenterTask
+        if detects:
+            from operators.detection.custom.folder import read_detection_data
+
+            boxes = read_detection_data(data, options.seed)
+            shown = _shown(boxes, [image.file for image in boxes.training], size, options)
+            task = TorchvisionDetectorTask(boxes, name, shown, seed=options.seed, variation=options.changes)
+        else:
+            from operators.segmentation.dataset import read_segmentation_data
+
+            masks = read_segmentation_data(data, options.seed)
+            shown = _shown(masks, [image.image for image in masks.training], size, options)
+            task = TorchvisionSegmenterTask(masks, name, shown, seed=options.seed, variation=options.changes)
         if weights is not None or initial is not None:
             state = cached_weights(name, weights) if weights is not None else weights_in(initial or out)
             taken, known = task.begin_with(state)
@@ -64,21 +76,8 @@ def train_torchvision(
     report(outcome, operator, options.json, params)
 
 
-def _detector(name: str, data: Path, size: str | None, options: ImageTraining) -> TorchvisionDetectorTask:
-    from operators.detection.custom.folder import read_detection_data
-    from operators.training.torchvision_tasks import TorchvisionDetectorTask
-
-    read = read_detection_data(data, options.seed)
-    shown = input_size(size, [image.file for image in read.training[:20]])
+def _shown(read: Read, files: list[Path], size: str | None, options: ImageTraining) -> tuple[int, int]:
+    """The size of training images, after what was read is told."""
+    shown = input_size(size, files[:20])
     tell_data(read, shown, options.json)
-    return TorchvisionDetectorTask(read, name, shown, seed=options.seed, variation=options.changes)
-
-
-def _segmenter(name: str, data: Path, size: str | None, options: ImageTraining) -> TorchvisionSegmenterTask:
-    from operators.segmentation.dataset import read_segmentation_data
-    from operators.training.torchvision_tasks import TorchvisionSegmenterTask
-
-    read = read_segmentation_data(data, options.seed)
-    shown = input_size(size, [image.image for image in read.training[:20]])
-    tell_data(read, shown, options.json)
-    return TorchvisionSegmenterTask(read, name, shown, seed=options.seed, variation=options.changes)
+    return shown

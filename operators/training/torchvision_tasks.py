@@ -16,9 +16,9 @@ from operators.detection.custom.augmentation import DetectionSample, view
 from operators.detection.custom.dataset import DetectionData
 from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.decode import Candidates
-from operators.learning.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.learning.augmentation import Variation, tensor_of
 from operators.learning.files import TrainingFileError, load_safely, save_atomically
-from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
+from operators.segmentation.dataset import VOID, SegmentationData
 from operators.segmentation.score import confusion, mean_iou
 from operators.torch_models import Family, new_model
 
@@ -120,7 +120,10 @@ class TorchvisionSegmenterTask(_TorchvisionTask):
         self.data, self.variation = data, variation
 
     def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor, int]:
-        views = [self._view(self.data.training[k], rng) for k, rng in zip(samples, rngs, strict=True)]
+        views = [
+            self.data.training[k].view(len(self.classes), self.size, self.variation, rng)
+            for k, rng in zip(samples, rngs, strict=True)
+        ]
         masks = torch.from_numpy(np.stack([mask for _, mask in views]).astype(np.int64))
         return torch.stack([_normalised(pixels) for pixels, _ in views]), masks, int(rngs[0].integers(1 << 31))
 
@@ -137,22 +140,12 @@ class TorchvisionSegmenterTask(_TorchvisionTask):
         device, count = next(network.parameters()).device, len(self.classes)
         table = np.zeros((count, count + 1), np.int64)
         for image in self.data.validation:
-            pixels, mask = self._view(image, None)
+            pixels, mask = image.view(len(self.classes), self.size, self.variation, None)
             with torch.inference_mode():
                 scores = network(_normalised(pixels)[None].to(device))["out"]
             table += confusion(mask, scores.argmax(dim=1)[0].cpu().numpy().astype(np.uint8), count)
         score = mean_iou(table)
         return {"score": score, "miou": score}
-
-    def _view(self, image: MaskedImage, rng: np.random.Generator | None) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """A random view of an image and its mask; without `rng` as it is, fitted into the input."""
-        pixels, mask = image.read(len(self.classes))
-        affine = fitted((pixels.shape[1], pixels.shape[0]), self.size)
-        variation = NONE if rng is None else self.variation
-        rng = np.random.default_rng(0) if rng is None else rng
-        affine = varied(affine, self.size, variation, rng)
-        seen = warp(mask, affine, self.size, border=VOID, labels=True)
-        return recolored(warp(pixels, affine, self.size), variation, rng), seen
 
 
 def weights_in(file: Path) -> dict[str, Tensor]:

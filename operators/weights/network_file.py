@@ -195,13 +195,13 @@ def open_second(network: Network, kind: str, needed: Sequence[str] = ()) -> Seco
     except (binascii.Error, ValueError) as error:
         raise NetworkFileError(f"{told} (metadata {SECOND!r}) is not base64: {error}") from None
     session = open_content(content, told)
-    facts = _facts_of(told, session, ("kind", "classes"))
+    facts = facts_of(told, session, ("kind", "classes"))
     if facts["kind"] != kind or tuple(facts["classes"]) != network.classes:
         raise NetworkFileError(
             f"{told} must be of the kind {kind} and of the classes {', '.join(network.classes)}; it is of the kind "
             f"{facts['kind']} and of the classes {', '.join(map(str, facts['classes']))}"
         )
-    return SecondNetwork(told, _facts_of(told, session, needed), session)
+    return SecondNetwork(told, facts_of(told, session, needed), session)
 
 
 def read_facts(file: Path) -> dict[str, Any]:
@@ -217,12 +217,10 @@ def training_seed(file: Path) -> int:
     return int(read_facts(file).get("seed", 0))
 
 
-def facts_of(file: Path, session: onnxruntime.InferenceSession, needed: Sequence[str] = _IMAGES) -> dict[str, Any]:
+def facts_of(
+    file: Path | str, session: onnxruntime.InferenceSession, needed: Sequence[str] = _IMAGES
+) -> dict[str, Any]:
     """Returns the metadata of an opened network file. Raises NetworkFileError where it lacks what is needed."""
-    return _facts_of(str(file), session, needed)
-
-
-def _facts_of(file: str, session: onnxruntime.InferenceSession, needed: Sequence[str]) -> dict[str, Any]:
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
         raise NetworkFileError(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 from typer.testing import CliRunner
 
 import dataflow
@@ -32,18 +33,13 @@ def run(*words: object) -> str:
 
 def keypoint_model(file: Path) -> str:
     """A network of RTMPose's signature that finds all joints in the middle of a person's box."""
-    onnx = pytest.importorskip("onnx")
-    make, real = onnx.helper, onnx.TensorProto.FLOAT
+    pytest.importorskip("onnx")
     middle = {
         name: np.eye(1, side, side // 2, np.float32).repeat(17, 0)[None] for name, side in (("x", 384), ("y", 512))
     }
-    nodes = [make.make_node("Identity", [name], [f"simcc_{name}"]) for name in middle]
-    given = [make.make_tensor_value_info("input", real, [1, 3, 256, 192])]
-    made = [make.make_tensor_value_info(f"simcc_{name}", real, list(each.shape)) for name, each in middle.items()]
-    kept = [onnx.numpy_helper.from_array(each, name) for name, each in middle.items()]
-    graph = make.make_graph(nodes, "joints", given, made, kept)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return str(file)
+    nodes = [node("Identity", name, f"simcc_{name}") for name in middle]
+    made = {f"simcc_{name}": each.shape for name, each in middle.items()}
+    return write_model(file, nodes, {"input": [1, 3, 256, 192]}, made, values=middle)
 
 
 @pytest.mark.long

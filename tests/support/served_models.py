@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
 
 from operators.models.registry import Model
 
@@ -82,3 +85,10 @@ def model_of(content: bytes, name: str = "net", **source: str) -> Model:
             "published": "nothing",
         }
     )
+
+
+def write_row(file: Path, row: Model, **fields: Any) -> str:
+    """Writes a registry of one row, some of whose fields are others."""
+    told = row.model_dump(exclude_none=True) | fields
+    file.write_text(json.dumps({"models": {told.pop("name"): told}}))
+    return str(file)

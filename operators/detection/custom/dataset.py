@@ -71,10 +71,7 @@ class DetectionData:
         def chosen(image: LabelledImage) -> LabelledImage:
             keep = number[image.classes] >= 0
             return replace(
-                image,
-                boxes=image.boxes[keep],
-                classes=number[image.classes[keep]],
-                ignored=image.ignored[keep],
+                image, boxes=image.boxes[keep], classes=number[image.classes[keep]], ignored=image.ignored[keep]
             )
 
         return replace(

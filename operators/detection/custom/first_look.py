@@ -54,13 +54,7 @@ class FirstLook:
         levels = len(self._strides)
         try:
             found = find_boxes(
-                outputs[:levels],
-                self._anchors,
-                self._strides,
-                len(network.classes),
-                threshold,
-                nms_iou,
-                most,
+                outputs[:levels], self._anchors, self._strides, len(network.classes), threshold, nms_iou, most
             )
         except ValueError as error:
             raise NetworkFileError(f"{network.file} does not fit its metadata: {error}") from None

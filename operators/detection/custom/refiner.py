@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.closeup import closeups, moved, numbers, places, windows
-from operators.detection.custom.first_look import Looked
+from operators.detection.custom.first_look import FirstLook, Looked
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms
@@ -74,6 +75,29 @@ class Refiner:
         self, seen: NDArray[np.uint8], around: NDArray[np.float32], known: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         return self._second.sides({"closeups": seen, "surroundings": around, "places": known})
+
+
+class GridFinder:
+    """A network that `dataflow train detector` wrote, in use: first look, and second look where the file has one.
+
+    Raises FileNotFoundError, or NetworkFileError for a file that is no such network.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._look = FirstLook(file)
+        self.names: tuple[str, ...] = self._look.network.classes
+        self._refiner = Refiner.within(self._look.network)
+        if self._refiner is not None:
+            self._look.reveal(self._refiner.maps)
+
+    def find(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Candidates:
+        """Finds the best `most` objects in an image (H, W, 3), RGB, in its pixels, by falling score.
+
+        Raises NetworkFileError where the network's output is not what its metadata say.
+        """
+        looked = self._look.look(pixels, threshold, nms_iou, most)
+        refiner = self._refiner
+        return looked.found if refiner is None else refiner.refined(pixels, looked, nms_iou)
 
 
 def inner_names(network: Network, names: Sequence[str]) -> list[str]:

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from operators.simulator.lanes import WALKER
 from operators.simulator.people.body import varied_body
 from operators.simulator.people.inhabitants import as_point, carry
-from operators.simulator.people.persons import Person, person_doing
-from operators.simulator.people.scripts import Act, Point, Polyline, Timeline
-from operators.simulator.scene import Builder
+from operators.simulator.people.persons import Person
+from operators.simulator.people.scripts import Act, Point, Polyline, Timeline, drinking
+from operators.simulator.scene import WALKER, Builder
 from operators.simulator.shapes import Array, Shape, pose
 from operators.simulator.things import furniture, objects
 from operators.simulator.things.furnishing import FLOOR, Wall
@@ -92,7 +91,7 @@ def add_chooser(builder: Builder, rng: Rng, wall: Wall, low: float, high: float)
     for seat in (c for c in candidates if c.label == "chair"):
         builder.relate(id, "sitting_on", seat.id, partial(_is, person.seat, seat.place))
     builder.relate(id, "on", FLOOR, lambda t: person.seat(t) is None)
-    builder.scripts.append(lambda t: person_doing(id, person, t))
+    builder.scripts.append(lambda t: person.doing(id, t))
     builder.reserve(id, Polyline(path).line(), WALKER)
     return start - 0.1, along + 0.1
 
@@ -142,29 +141,17 @@ def errands(rng: Rng, candidates: list[Candidate], origin: float, facing: float,
         acts.append(Act("standing", float(rng.uniform(1.0, 2.5)), goal, (here, here), (come, go)))
         acts.append(Act("walking", max(1.2, abs(there - here) / 0.6), goal, (here, there)))
         acts.append(Act("standing", 0.9, goal, (there, there), (go, toward)))
-        acts += _sitting(rng, goal, there, toward, now) if now.label == "chair" else _drinking(goal, there, toward, now)
+        at, look = (there, there), (toward, toward)
+        if now.label == "chair":
+            acts += _sitting(rng, Act("sitting", 0.0, goal, at, look, seat=now.place))
+        else:
+            acts += drinking(Act("drinking", 0.0, goal, at, look, grasp=now.place), now.id)
     return Timeline(acts, phase=float(rng.uniform(0, sum(act.seconds for act in acts))))
 
 
-def _sitting(rng: Rng, goal: str, along: float, yaw: float, chair: Candidate) -> list[Act]:
-    at, look = (along, along), (yaw, yaw)
+def _sitting(rng: Rng, acting: Act) -> list[Act]:
     return [
-        Act("sitting_down", 1.7, goal, at, look, sit=(0.0, 1.0), seat=chair.place),
-        Act("sitting", float(rng.uniform(4, 8)), goal, at, look, sit=(1.0, 1.0), seat=chair.place),
-        Act("standing_up", 1.6, goal, at, look, sit=(1.0, 0.0), seat=chair.place),
-    ]
-
-
-def _drinking(goal: str, along: float, yaw: float, drink: Candidate) -> list[Act]:
-    def act(name: str, seconds: float, reach: tuple[float, float], lift: tuple[float, float]) -> Act:
-        return Act(
-            name, seconds, goal, (along, along), (yaw, yaw), reach=reach, lift=lift, object=drink.id, grasp=drink.place
-        )
-
-    return [
-        act("reaching", 1.2, (0.0, 1.0), (0.0, 0.0)),
-        act("drinking", 1.3, (1.0, 1.0), (0.0, 1.0)),
-        act("drinking", 1.0, (1.0, 1.0), (1.0, 1.0)),
-        act("drinking", 1.3, (1.0, 1.0), (1.0, 0.0)),
-        act("reaching", 1.0, (1.0, 0.0), (0.0, 0.0)),
+        replace(acting, activity="sitting_down", seconds=1.7, sit=(0.0, 1.0)),
+        replace(acting, seconds=float(rng.uniform(4, 8)), sit=(1.0, 1.0)),
+        replace(acting, activity="standing_up", seconds=1.6, sit=(1.0, 0.0)),
     ]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from operators.simulator.lanes import ROVER, WALKER
 from operators.simulator.people.body import drawn_body
 from operators.simulator.people.movers import Carried, Driving, Rolling
-from operators.simulator.people.persons import Person, person_doing
+from operators.simulator.people.persons import Person
 from operators.simulator.people.scripts import Point, Polyline, Timeline, coffee_break, errand, pacing
-from operators.simulator.scene import Builder
+from operators.simulator.scene import ROVER, WALKER, Builder
 from operators.simulator.shapes import Array, Shape, pose
 from operators.simulator.things import furniture, objects
 from operators.simulator.things.furnishing import FLOOR, Wall, put_desk
@@ -78,7 +77,7 @@ def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline:
     builder.relate(id, "sitting_on", place.chair, lambda t: person.seat(t) is not None)
     builder.relate(id, "on", FLOOR, lambda t: person.seat(t) is None)
     builder.relate(id, "reaching_for", place.mug, lambda t: person.reached_for(t) == place.mug)
-    builder.scripts.append(lambda t: person_doing(id, person, t))
+    builder.scripts.append(lambda t: person.doing(id, t))
     builder.reserve(id, np.concatenate([Polyline(path).line(), place.pelvis[None, :2]]), WALKER)
     return id
 
@@ -127,7 +126,7 @@ def add_walker(builder: Builder, rng: Rng, path: Array) -> int:
     id = builder.move("person", body.parts, person)
     builder.reserve(id, Polyline(path).line(), WALKER)
     builder.relate(id, "on", FLOOR)
-    builder.scripts.append(lambda t: person_doing(id, person, t))
+    builder.scripts.append(lambda t: person.doing(id, t))
     return id
 
 

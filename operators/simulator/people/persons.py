@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from operators.simulator.people.body import Body, Posture
-from operators.simulator.people.scripts import Act, Point, Polyline, Timeline, mix
+from operators.simulator.people.scripts import Point, Polyline, Timeline, mix
 from operators.simulator.scene import Doing
 from operators.simulator.shapes import Array, pose
+from operators.simulator.trajectory import wrapped
 
 _STRIDE = 1.25  # metres a full step, left and right
 
@@ -32,9 +33,13 @@ class Person:
             self._parts = (t, self.body.poses(self.posture(t)))
         return self._parts[1]
 
+    def doing(self, thing: int, t: float) -> Doing:
+        act, _, began = self.timeline.at(t)
+        return Doing(thing, act.activity, began, act.goal, act.object)
+
     def held(self, t: float) -> int:
         """The object that the hand has, -1 for none."""
-        act, _, _ = self.timeline.at(t)
+        act = self.timeline.at(t)[0]
         return act.object if act.activity == "drinking" else -1
 
     def reached_for(self, t: float) -> int:
@@ -64,7 +69,7 @@ class Person:
         if act.yaw is None:
             yaw = heading if forwards else heading + math.pi
         else:
-            yaw = act.yaw[0] + x * _wrap(act.yaw[1] - act.yaw[0])
+            yaw = act.yaw[0] + x * wrapped(act.yaw[1] - act.yaw[0])
         sit = mix(act.sit, x)
         pelvis = np.array([*place, self.body.hip_height])
         forward, left = np.array([math.cos(yaw), math.sin(yaw), 0]), np.array([-math.sin(yaw), math.cos(yaw), 0])
@@ -75,8 +80,11 @@ class Person:
             pelvis[:2] += back * (seat[:2] - pelvis[:2])
             pelvis[2] += sit * (seat[2] - pelvis[2])
             middle = middle + 0.06 * sit * forward
-        speed = abs(act.along[1] - act.along[0]) / act.seconds * 30 * _bell(self._share(t, act, began))
-        feet, swing, drop = self._gait(middle, along, yaw, min(1.0, speed / 0.5), forwards)
+        share = min(1.0, max(0.0, (t - began) / act.seconds))
+        slope = share * share * (1 - share) * (1 - share)  # of the smootherstep, over 30
+        speed = abs(act.along[1] - act.along[0]) / act.seconds * 30 * slope
+        run = along if forwards else -along
+        feet, swing, drop = self._gait(middle, forward, left, run, min(1.0, speed / 0.5))
         pelvis[2] -= drop
         changing = act.sit[0] != act.sit[1]
         reach = mix(act.reach, x)
@@ -91,16 +99,11 @@ class Person:
             hands[self._hand] += reach * (goal - hands[self._hand]) + arc
         return Posture(pelvis, yaw, lean, feet, hands)
 
-    def _share(self, t: float, act: Act, began: float) -> float:
-        return min(1.0, max(0.0, (t - began) / act.seconds))
-
     def _gait(
-        self, middle: Array, along: float, yaw: float, strength: float, forwards: bool
+        self, middle: Array, forward: Array, left: Array, run: float, strength: float
     ) -> tuple[Array, Array, float]:
         """Soles (2, 3), swing of the arms (2,), and how much the pelvis drops."""
-        forward, left = np.array([math.cos(yaw), math.sin(yaw), 0]), np.array([-math.sin(yaw), math.cos(yaw), 0])
         feet, swing = np.zeros((2, 3)), np.zeros(2)
-        run = along if forwards else -along
         for side in (0, 1):
             f = (run / _STRIDE + 0.5 * side) % 1.0
             half = 0.3 * _STRIDE
@@ -129,18 +132,3 @@ class Person:
             resting = pelvis + 0.33 * forward + 0.11 * sign * left + np.array([0, 0, 0.11])
             hands[side] = hanging + sit * (resting - hanging)
         return hands
-
-
-def person_doing(thing: int, person: Person, t: float) -> Doing:
-    """Returns a person's script."""
-    act, _, began = person.timeline.at(t)
-    return Doing(thing, act.activity, began, act.goal, act.object)
-
-
-def _bell(x: float) -> float:
-    """Slope of the smootherstep over 30."""
-    return x * x * (1 - x) * (1 - x)
-
-
-def _wrap(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -85,23 +85,18 @@ class Polyline:
         return np.asarray(self._spline(u)), math.atan2(float(d[1]), float(d[0]))
 
 
-def errand(
-    path: Array, sit_yaw: float, mug: int, table: int, *, walk: float = 0.62, wait: float = 2.0, phase: float = 0.0
-) -> Timeline:
+def errand(path: Array, sit_yaw: float, mug: int, table: int, *, phase: float) -> Timeline:
     """Walks to a chair at the end of the path, sits down, drinks from a mug, gets up, and walks back."""
-    line = Polyline(path)
-    _, leave = line.at(0.0)
-    _, arrive = line.at(line.length)
-    stroll = max(1.5, line.length / walk)
+    line, leave, arrive, stroll = _there_and_back(path, 0.62)
     full, none = (line.length, line.length), (0.0, 0.0)
     go, drink, back = f"sit down at table {table}", f"drink from mug {mug}", "walk away"
     return Timeline(
         [
-            Act("standing", wait, go, none, (leave + math.pi, leave)),
+            Act("standing", 2.0, go, none, (leave + math.pi, leave)),
             Act("walking", stroll, go, (0.0, line.length)),
             Act("standing", 0.9, go, full, (arrive, sit_yaw)),
             Act("sitting_down", 1.7, go, full, (sit_yaw, sit_yaw), sit=(0.0, 1.0)),
-            *_drinking(full, sit_yaw, mug, drink),
+            *_sipping(full, sit_yaw, mug, drink),
             Act("standing_up", 1.6, back, full, (sit_yaw, sit_yaw), sit=(1.0, 0.0)),
             Act("standing", 0.9, back, full, (sit_yaw, arrive + math.pi)),
             Act("walking", stroll, back, (line.length, 0.0)),
@@ -110,43 +105,51 @@ def errand(
     )
 
 
-def coffee_break(yaw: float, mug: int, *, phase: float = 0.0) -> Timeline:
+def coffee_break(yaw: float, mug: int, *, phase: float) -> Timeline:
     """Sits all the time and drinks now and then."""
     goal = f"drink from mug {mug}"
     rest = Act("sitting", 3.0, "rest", (0.0, 0.0), (yaw, yaw), sit=(1.0, 1.0))
-    return Timeline([rest, *_drinking((0.0, 0.0), yaw, mug, goal)], phase)
+    return Timeline([rest, *_sipping((0.0, 0.0), yaw, mug, goal)], phase)
 
 
-def _drinking(along: tuple[float, float], yaw: float, mug: int, goal: str) -> list[Act]:
-    def act(name: str, seconds: float, reach: tuple[float, float], lift: tuple[float, float], object: int) -> Act:
-        return Act(name, seconds, goal, along, (yaw, yaw), (1.0, 1.0), reach, lift, object)
-
+def drinking(acting: Act, drink: int) -> list[Act]:
+    """The acts of drinking from a thing, by one who otherwise does as in `acting`."""
     return [
-        act("sitting", 1.6, (0.0, 0.0), (0.0, 0.0), -1),
-        act("reaching", 1.2, (0.0, 1.0), (0.0, 0.0), mug),
-        act("drinking", 1.3, (1.0, 1.0), (0.0, 1.0), mug),
-        act("drinking", 1.0, (1.0, 1.0), (1.0, 1.0), mug),
-        act("drinking", 1.3, (1.0, 1.0), (1.0, 0.0), mug),
-        act("reaching", 1.0, (1.0, 0.0), (0.0, 0.0), mug),
-        act("sitting", 1.4, (0.0, 0.0), (0.0, 0.0), -1),
+        replace(acting, activity=name, seconds=seconds, reach=reach, lift=lift, object=drink)
+        for name, seconds, reach, lift in (
+            ("reaching", 1.2, (0.0, 1.0), (0.0, 0.0)),
+            ("drinking", 1.3, (1.0, 1.0), (0.0, 1.0)),
+            ("drinking", 1.0, (1.0, 1.0), (1.0, 1.0)),
+            ("drinking", 1.3, (1.0, 1.0), (1.0, 0.0)),
+            ("reaching", 1.0, (1.0, 0.0), (0.0, 0.0)),
+        )
     ]
 
 
-def pacing(path: Array, *, walk: float = 0.7, wait: float = 2.5, phase: float = 0.0) -> Timeline:
+def _sipping(along: tuple[float, float], yaw: float, mug: int, goal: str) -> list[Act]:
+    """The same, seated before and after."""
+    seated = Act("sitting", 1.6, goal, along, (yaw, yaw), (1.0, 1.0))
+    return [seated, *drinking(seated, mug), replace(seated, seconds=1.4)]
+
+
+def pacing(path: Array, *, walk: float, phase: float) -> Timeline:
     """Walks to the end of the path, stands there, and comes back."""
-    line = Polyline(path)
-    _, leave = line.at(0.0)
-    _, arrive = line.at(line.length)
-    stroll = max(1.5, line.length / walk)
+    line, leave, arrive, stroll = _there_and_back(path, walk)
     return Timeline(
         [
-            Act("standing", wait, "wait", (0.0, 0.0), (leave + math.pi, leave)),
+            Act("standing", 2.5, "wait", (0.0, 0.0), (leave + math.pi, leave)),
             Act("walking", stroll, "walk to and fro", (0.0, line.length)),
-            Act("standing", wait, "wait", (line.length, line.length), (arrive, arrive + math.pi)),
+            Act("standing", 2.5, "wait", (line.length, line.length), (arrive, arrive + math.pi)),
             Act("walking", stroll, "walk to and fro", (line.length, 0.0)),
         ],
         phase,
     )
+
+
+def _there_and_back(path: Array, walk: float) -> tuple[Polyline, float, float, float]:
+    """The path, its headings at the beginning and the end, and the seconds that it takes at a speed (m/s)."""
+    line = Polyline(path)
+    return line, line.at(0.0)[1], line.at(line.length)[1], max(1.5, line.length / walk)
 
 
 def mix(ends: tuple[float, float], x: float) -> float:

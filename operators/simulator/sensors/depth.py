@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.simulator.rendering.optics import View
-from operators.simulator.sensors.noise import NoisePool
+from operators.simulator.sensors.color import NoisePool
 from operators.simulator.settings import DepthCamera
 
 F32 = NDArray[np.float32]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.simulator.settings import Mount
+from operators.simulator.settings import Mount, Mounted
 
 Array = NDArray[np.float64]
 
@@ -31,16 +30,6 @@ def mounted(mount: Mount) -> Array:
     )
     T.flags.writeable = False
     return T
-
-
-class Mounted(Protocol):
-    """A sensor with a mount, and the error of its calibration."""
-
-    @property
-    def mount(self) -> Mount: ...
-
-    @property
-    def mount_error(self) -> Mount: ...
 
 
 def place(sensor: Mounted) -> Array:

@@ -55,7 +55,7 @@ class GnssModel:
         self._satellites = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
 
     def measure(
-        self, gnss: Gnss, stage: Stage, t: float, rng: np.random.Generator, stamp: int, frame: str
+        self, stage: Stage, gnss: Gnss, t: float, rng: np.random.Generator, stamp: int, frame: str
     ) -> NavSatFix | None:
         """A fix, or None where too few satellites are in sight."""
         keep = math.exp(-1 / (gnss.rate * gnss.drift_time))

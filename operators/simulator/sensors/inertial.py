@@ -13,6 +13,7 @@ from dataflow.messages import Imu
 from operators.simulator.drive import Drive
 from operators.simulator.sensors.frames import Array, place
 from operators.simulator.settings import Inertial
+from operators.simulator.stage import Stage
 
 
 def true_reading(drive: Drive, imu: Inertial, t: float) -> tuple[Array, Array]:
@@ -37,8 +38,8 @@ class ImuModel:
         self.gyro_bias = np.array(imu.gyro_bias)
         self.accel_bias = np.array(imu.accel_bias)
 
-    def measure(self, imu: Inertial, drive: Drive, t: float, rng: np.random.Generator, stamp: int, frame: str) -> Imu:
-        omega, force = true_reading(drive, imu, t)
+    def measure(self, stage: Stage, imu: Inertial, t: float, rng: np.random.Generator, stamp: int, frame: str) -> Imu:
+        omega, force = true_reading(stage.drive, imu, t)
         white = math.sqrt(imu.rate)  # of a density, sampled at the rate
         noise = rng.standard_normal((4, 3))
         self.gyro_bias = self.gyro_bias + imu.gyro_walk / white * noise[2]

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from dataflow.messages import MagneticField
-from operators.simulator.drive import Drive
 from operators.simulator.sensors.frames import Array, place
 from operators.simulator.settings import Magnetometer
+from operators.simulator.stage import Stage
 
 _WAVES = 8
 _WAVELENGTHS = (1.5, 8.0)  # metres
@@ -38,9 +38,9 @@ class MagneticModel:
         return np.asarray(np.sqrt(2 / _WAVES) * np.sin(angle).sum(axis=1))
 
     def measure(
-        self, sensor: Magnetometer, drive: Drive, t: float, rng: np.random.Generator, stamp: int, frame: str
+        self, stage: Stage, sensor: Magnetometer, t: float, rng: np.random.Generator, stamp: int, frame: str
     ) -> MagneticField:
-        T = drive.poses([t])[0] @ place(sensor)
+        T = stage.T_world_base(t) @ place(sensor)
         field = T[:3, :3].T @ (earth_field(sensor) + sensor.disturbance * self.bend(T[:3, 3]))
         field = field * [1 + sensor.soft_iron, 1, 1] + np.array(sensor.hard_iron)
         return MagneticField(

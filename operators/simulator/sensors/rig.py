@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from dataflow.messages import (
-    CameraInfo,
-    CompressedDepth,
-    CompressedImage,
-    DepthImage,
-    Image,
-    Message,
-    Pose,
-    Transforms,
-)
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, Message, Pose, Transforms
 from operators.simulator import settings, truth
 from operators.simulator.rendering.optics import Optics
 from operators.simulator.sensors import color, depth, gnss, inertial, landmarks, lidar, magnetic, radar, wheels
+from operators.simulator.sensors.color import NoisePool
 from operators.simulator.sensors.frames import BODY_TO_OPTICAL, Array, displaced_optical, mounted
-from operators.simulator.sensors.noise import NoisePool
 from operators.simulator.sensors.schedule import Tick
 from operators.simulator.stage import Stage
 
@@ -43,31 +36,37 @@ class Rig:
     """Sensors with their calibration as it is published. Their settings at a time come with every measurement."""
 
     def __init__(
-        self,
-        stage: Stage,
-        seed: int,
-        frames: FrameNames,
-        sensors: settings.Sensors,
-        true: settings.Truth,
+        self, stage: Stage, seed: int, frames: FrameNames, sensors: settings.Sensors, true: settings.Truth
     ) -> None:
         self.stage, self.frames, self._seed, self._sensors, self._true = stage, frames, seed, sensors, true
         camera, depth_camera, pair = sensors.color_camera, sensors.depth_camera, sensors.stereo
         self._pool = NoisePool(seed)
         self._color_optics = _optics(camera.width, camera.height, camera.focal)
         self._depth_optics = _optics(
-            depth_camera.width or camera.width,
-            depth_camera.height or camera.height,
-            depth_camera.focal or camera.focal,
+            depth_camera.width or camera.width, depth_camera.height or camera.height, depth_camera.focal or camera.focal
         )
         self._stereo_optics = _optics(pair.width, pair.height, pair.focal)
         mount: settings.Mount = camera.mount or stage.world.camera_mount
         self.T_base_color = mounted(mount) @ BODY_TO_OPTICAL
         self.T_base_depth = self.T_base_color @ mounted((*depth_camera.offset, *depth_camera.rotation))
         self.T_base_left = mounted(pair.mount) @ BODY_TO_OPTICAL if pair.mount else self.T_base_color
-        self._imu_model = inertial.ImuModel(sensors.inertial)
-        self._gnss_model = gnss.GnssModel(sensors.gnss, seed)
         self._wheel_model = wheels.WheelModel(sensors.wheels, seed)
-        self._magnetic_model = magnetic.MagneticModel(seed)
+        single: dict[str, tuple[str, str, Callable[..., Message | None]]] = {
+            "lidar": ("points", "lidar", lidar.sweep),
+            "inertial": ("imu", "imu", inertial.ImuModel(sensors.inertial).measure),
+            "magnetometer": ("magnetic_field", "magnetometer", magnetic.MagneticModel(seed).measure),
+            "radar": ("radar_scan", "radar", radar.scan),
+            "landmarks": ("sightings", sensors.landmarks.frame, landmarks.sightings),
+            "gnss": ("fix", "gnss", gnss.GnssModel(sensors.gnss, seed).measure),
+        }
+        self.measures: dict[str, Callable[..., Messages]] = {
+            "color_camera": self.color,
+            "depth_camera": self.depth,
+            "stereo": self.stereo,
+            "wheels": self.wheels,
+            **{name: partial(self._single, *how) for name, how in single.items()},
+        }
+        """Measurements by the parameter of their sensor: (settings, seconds, tick, random numbers) → messages."""
 
     def color(self, camera: settings.ColorCamera, t: float, tick: Tick, rng: Rng) -> Messages:
         T_base_camera = displaced_optical(self.T_base_color, camera.mount_error)
@@ -141,31 +140,19 @@ class Rig:
             messages[port] = Image(stamp=tick.stamp, frame=f"stereo_{port}_optical", data=pixels)
         return messages
 
-    def lidar(self, scanner: settings.Lidar, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {"points": lidar.sweep(self.stage, scanner, t, rng, tick.stamp, "lidar")}
-
-    def imu(self, imu: settings.Inertial, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {"imu": self._imu_model.measure(imu, self.stage.drive, t, rng, tick.stamp, "imu")}
-
-    def magnetometer(self, sensor: settings.Magnetometer, t: float, tick: Tick, rng: Rng) -> Messages:
-        field = self._magnetic_model.measure(sensor, self.stage.drive, t, rng, tick.stamp, "magnetometer")
-        return {"magnetic_field": field}
+    def _single(
+        self, port: str, frame: str, measure: Callable[..., Message | None],
+        sensor: settings.Sensor, t: float, tick: Tick, rng: Rng,
+    ) -> Messages:  # fmt: skip
+        """The one message of a sensor, or none."""
+        message = measure(self.stage, sensor, t, rng, tick.stamp, frame)
+        return {} if message is None else {port: message}
 
     def wheels(self, driven: settings.Wheels, t: float, tick: Tick, rng: Rng) -> Messages:
         counts, odometry = self._wheel_model.measure(
             driven, self.stage.world.path, t, rng, tick.stamp, self.frames.odometry, self.frames.base
         )
         return {"wheel_ticks": counts, "wheel_odometry": odometry}
-
-    def radar(self, sensor: settings.Radar, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {"radar_scan": radar.scan(self.stage, sensor, t, rng, tick.stamp, "radar")}
-
-    def landmarks(self, sensor: settings.Landmarks, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {"sightings": landmarks.sightings(self.stage, sensor, t, rng, tick.stamp, sensor.frame)}
-
-    def gnss(self, receiver: settings.Gnss, t: float, tick: Tick, rng: Rng) -> Messages:
-        fix = self._gnss_model.measure(receiver, self.stage, t, rng, tick.stamp, "gnss")
-        return {} if fix is None else {"fix": fix}
 
     def poses(self, depth_camera: settings.DepthCamera, t: float, tick: Tick) -> Messages:
         """The true ones of the base and of the depth camera, where that really is."""

@@ -96,18 +96,5 @@ def grass(rng: Rng) -> Pixels:
 
 PAINTERS: dict[str, Callable[[Rng], Pixels]] = {
     painter.__name__: painter
-    for painter in (
-        plain,
-        plaster,
-        wood,
-        parquet,
-        carpet,
-        tiles,
-        ceiling,
-        fabric,
-        checked,
-        metal,
-        asphalt,
-        grass,
-    )
+    for painter in (plain, plaster, wood, parquet, carpet, tiles, ceiling, fabric, checked, metal, asphalt, grass)
 }

@@ -79,6 +79,16 @@ def ring(x: float, y: float, height: float, *, inside: bool = True) -> list[Wall
     return [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
 
 
+def marks_on(rng: Rng, walls: Sequence[Wall], shares: Sequence[float], low: float, astray: float = 0.0) -> list[Array]:
+    """Landmarks (3,) on walls at shares of their lengths, drawn up to `astray` more or less, from `low` to 2.2 m up."""
+    return [
+        wall.place(0.03, wall.length * (share + off), rng.uniform(low, 2.2))[:3, 3]
+        for wall in walls
+        for share in shares
+        for off in [rng.uniform(-astray, astray) if astray else 0.0]
+    ]
+
+
 def raise_wall(builder: Builder, wall: Wall, style: Style, *, accent: bool = False) -> None:
     """The wall's surface and its skirting board."""
     half = wall.length / 2
@@ -271,10 +281,6 @@ def put_boxes(builder: Builder, rng: Rng, T: Array) -> None:
         z += height
 
 
-def put_on_floor(builder: Builder, label: str, shape: Shape, T: Array) -> int:
-    return builder.put(label, shape, T, on=FLOOR)
-
-
 def line_wall(
     builder: Builder, rng: Rng, wall: Wall, free: Sequence[tuple[float, float]], *, depth: float = 1.55
 ) -> None:
@@ -317,4 +323,4 @@ def _stand(builder: Builder, rng: Rng, wall: Wall, name: str, along: float, widt
         yaw = rng.uniform(-0.4, 0.4)
         low, high = bounds(at(shape, yaw=yaw))
         if high[0] - low[0] + 0.04 <= depth and high[1] - low[1] <= width + 0.3:
-            put_on_floor(builder, name, shape, wall.place(0.04 - float(low[0]), along, 0, yaw))
+            builder.put(name, shape, wall.place(0.04 - float(low[0]), along, 0, yaw), on=FLOOR)

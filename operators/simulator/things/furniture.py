@@ -11,19 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from operators.simulator.shapes import (
-    Color,
-    Material,
-    Shape,
-    at,
-    bone,
-    box,
-    cylinder,
-    ellipsoid,
-    lathe,
-    moved,
-    sheet,
-)
+from operators.simulator.shapes import Color, Material, Shape, at, bone, box, cylinder, ellipsoid, lathe, moved, sheet
 
 Rng = np.random.Generator
 

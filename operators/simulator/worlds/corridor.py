@@ -12,12 +12,13 @@ from operators.simulator.scene import Builder, Light, Order, World
 from operators.simulator.shapes import Array
 from operators.simulator.things import furniture
 from operators.simulator.things.furnishing import (
+    FLOOR,
     Style,
     Wall,
     decorate,
     lay_floor,
     line_wall,
-    put_on_floor,
+    marks_on,
     raise_wall,
     ring,
 )
@@ -59,29 +60,14 @@ def corridor(seed: int, order: Order) -> World:
         line_wall(builder, rng, wall, _between(spans, half), depth=0.5)
         decorate(builder, rng, wall, windows=False, taken=spans)
 
-    lights = tuple(
+    lights = [
         Light((px, py, height - 0.1), rng.uniform(1.5, 1.9), radius=0.3)
         for px, py in _lamp_places(x - width / 2, y - width / 2)
-    )
-    landmarks = np.array(
-        [
-            wall.place(0.03, wall.length * (share + rng.uniform(-0.05, 0.05)), rng.uniform(1.2, 2.2))[:3, 3]
-            for wall in (*outer, *inner)
-            for share in (-0.35, -0.1, 0.1, 0.35)
-        ]
-    )
-    return World(
-        "corridor",
-        tuple(builder.things),
-        lights,
-        0.5,
-        order.drive(_tour(block_x, block_y, width) if order.tour else _lane(block_x, block_y)),
-        landmarks,
-        (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
-        tuple(builder.placements),
-        tuple(builder.scripts),
-        lanes=tuple(builder.lanes),
-    )
+    ]
+    landmarks = marks_on(rng, (*outer, *inner), (-0.35, -0.1, 0.1, 0.35), 1.2, astray=0.05)
+    path = order.drive(_tour(block_x, block_y, width) if order.tour else _lane(block_x, block_y))
+    mount = (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0)
+    return builder.world("corridor", lights, 0.5, path, np.array(landmarks), mount)
 
 
 def _lane(x: float, y: float) -> Array:
@@ -122,7 +108,8 @@ def _doors(
         middle = half * ((2 * k + 1) / count - 1) * 0.75 + rng.uniform(-0.2, 0.2)
         width = rng.uniform(0.82, 0.95)
         angle = rng.uniform(0, opened) if rng.uniform() < 0.5 else 0.0
-        put_on_floor(builder, "door", furniture.door(rng, width, rng.uniform(2.0, 2.1), angle), wall.place(0.0, middle))
+        leaf = furniture.door(rng, width, rng.uniform(2.0, 2.1), angle)
+        builder.put("door", leaf, wall.place(0.0, middle), on=FLOOR)
         spans.append((middle - width / 2 - 0.15, middle + width / 2 + 0.15))
     return spans
 

@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 
-from operators.simulator.lanes import WALKER
 from operators.simulator.people.choosers import add_chooser
 from operators.simulator.people.inhabitants import add_ball, add_desk_worker, add_rover, add_walker
-from operators.simulator.scene import Builder, Light, Order, World
+from operators.simulator.scene import WALKER, Builder, Light, Order, World
 from operators.simulator.shapes import Array, pose
 from operators.simulator.things import furniture
 from operators.simulator.things.furnishing import (
@@ -19,7 +18,7 @@ from operators.simulator.things.furnishing import (
     decorate,
     lay_floor,
     line_wall,
-    put_on_floor,
+    marks_on,
     raise_wall,
     ring,
     scatter,
@@ -56,7 +55,7 @@ def office(seed: int, order: Order) -> World:
         if k == door_wall:
             middle, width = rng.uniform(-0.4, 0.4) * half, rng.uniform(0.85, 0.95)
             shape = furniture.door(rng, width, rng.uniform(2.0, 2.1), rng.uniform(0.0, 0.9))
-            put_on_floor(builder, "door", shape, wall.place(0.0, middle))
+            builder.put("door", shape, wall.place(0.0, middle), on=FLOOR)
             free = [(-half, middle - 0.75), (middle + 0.75, half)]
             taken.append((middle - 0.65, middle + 0.65))
         span = kept[k]
@@ -72,25 +71,15 @@ def office(seed: int, order: Order) -> World:
             _island(builder, rng, 0.42, x=side * 0.55 * a)
     else:
         _island(builder, rng, min(a, b) - 0.42)
-    lights = tuple(
+    lights = [
         Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2))
         for sx in (-1, 1)
         for sy in (-1, 1)
-    )
-    landmarks = _landmarks(rng, walls)
+    ]
+    landmarks = np.array(marks_on(rng, walls, (-0.36, -0.12, 0.12, 0.36), 1.0, astray=0.05))
     pitch = math.radians(rng.uniform(7, 11))
-    return World(
-        "office",
-        tuple(builder.things),
-        lights,
-        0.62,
-        path,
-        landmarks,
-        (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, pitch, 0.0),
-        tuple(builder.placements),
-        tuple(builder.scripts),
-        lanes=tuple(builder.lanes),
-    )
+    mount = (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, pitch, 0.0)
+    return builder.world("office", lights, 0.62, path, landmarks, mount)
 
 
 def _loop(rng: np.random.Generator, a: float, b: float) -> Array:
@@ -153,13 +142,3 @@ def _island(builder: Builder, rng: np.random.Generator, radius: float, *, x: flo
     T = pose(x, 0, 0, rng.uniform(-math.pi, math.pi))
     id = builder.put("table", shape, T, on=FLOOR)
     scatter(builder, rng, id, T, surface, small_items(rng, 6))
-
-
-def _landmarks(rng: np.random.Generator, walls: list[Wall]) -> Array:
-    """Four points on every wall."""
-    points = [
-        wall.place(0.03, wall.length * (share + rng.uniform(-0.05, 0.05)), rng.uniform(1.0, 2.2))[:3, 3]
-        for wall in walls
-        for share in (-0.36, -0.12, 0.12, 0.36)
-    ]
-    return np.array(points)

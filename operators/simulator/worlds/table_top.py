@@ -17,7 +17,7 @@ from operators.simulator.things.furnishing import (
     decorate,
     lay_floor,
     line_wall,
-    put_on_floor,
+    marks_on,
     raise_wall,
     ring,
     scatter,
@@ -48,36 +48,22 @@ def table_top(seed: int, order: Order) -> World:
         taken: list[tuple[float, float]] = []
         free = [(-half, half)]
         if k == door_wall:
-            put_on_floor(builder, "door", furniture.door(rng, 0.9, 2.05, rng.uniform(0, 0.4)), wall.place(0.0, 0.0))
+            leaf = furniture.door(rng, 0.9, 2.05, rng.uniform(0, 0.4))
+            builder.put("door", leaf, wall.place(0.0, 0.0), on=FLOOR)
             taken, free = [(-0.6, 0.6)], [(-half, -0.65), (0.65, half)]
         if k in kept:
             free = [(-half, kept[k][0]), (kept[k][1], half)]
         line_wall(builder, rng, wall, free, depth=0.55)
         decorate(builder, rng, wall, windows=k % 2 == 0, taken=taken)
     _lay_table(builder, rng, order.movers)
-    lights = tuple(
+    lights = [
         Light((0.9 * math.cos(a), 0.9 * math.sin(a), height - 0.1), rng.uniform(1.4, 1.9))
         for a in rng.uniform(0, 6) + np.array([0, 2.1, 4.2])
-    )
-    landmarks = np.array(
-        [
-            wall.place(0.03, wall.length * share, rng.uniform(1.0, 2.2))[:3, 3]
-            for wall in walls
-            for share in (-0.3, 0.0, 0.3)
-        ]
-    )
-    return World(
-        "table_top",
-        tuple(builder.things),
-        lights,
-        0.62,
-        order.drive(_rosette() if order.tour else _circle(rng), at_most=0.6),
-        landmarks,
-        (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
-        tuple(builder.placements),
-        tuple(builder.scripts),
-        lanes=tuple(builder.lanes),
-    )
+    ]
+    landmarks = np.array(marks_on(rng, walls, (-0.3, 0.0, 0.3), 1.0))
+    path = order.drive(_rosette() if order.tour else _circle(rng), at_most=0.6)
+    mount = (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2)
+    return builder.world("table_top", lights, 0.62, path, landmarks, mount)
 
 
 def _circle(rng: np.random.Generator) -> Array:

@@ -18,8 +18,8 @@ from operators.simulator.things.furnishing import (
     decorate,
     lay_floor,
     line_wall,
+    marks_on,
     put_boxes,
-    put_on_floor,
     raise_wall,
     scatter,
     small_items,
@@ -73,20 +73,10 @@ def yard(seed: int, order: Order) -> World:
         (float(place[0]), float(place[1]), float(place[2])), 50.0**2 * rng.uniform(1.5, 1.9), radius=0.6,
         area=((0.2, -half), (length, half)), switched=False,
     )  # fmt: skip
-    return World(
-        "yard",
-        tuple(builder.things),
-        (*lamps, sun),
-        0.6,
-        order.drive(_tour() if order.tour else _round()),
-        _landmarks(rng, walls, length, half),
-        (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
-        tuple(builder.placements),
-        tuple(builder.scripts),
-        lanes=tuple(builder.lanes),
-        daylight=0.6,
-        sky=(168.0, 200.0, 240.0),
-    )
+    path = order.drive(_tour() if order.tour else _round())
+    landmarks = _landmarks(rng, walls, length, half)
+    mount = (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0)
+    return builder.world("yard", (*lamps, sun), 0.6, path, landmarks, mount, daylight=0.6, sky=(168.0, 200.0, 240.0))
 
 
 _INSIDE = [(-2.0, 2.6), (-4.6, 2.5), (-6.3, 0.0), (-4.6, -2.5), (-2.0, -2.6)]
@@ -143,10 +133,8 @@ def _furnish(builder: Builder, rng: Rng, length: float, half: float) -> None:
     """Returns what stands in the yard: bushes and a table in its middle, boxes and bins along the fences."""
     for k in range(3):
         angle = 2 * math.pi * (k / 3 + rng.uniform(-0.05, 0.05))
-        put_on_floor(
-            builder, "plant", furniture.plant(rng, rng.uniform(1.3, 2.1)),
-            pose(5.9 + 0.8 * math.cos(angle), 0.8 * math.sin(angle)),
-        )  # fmt: skip
+        bush = furniture.plant(rng, rng.uniform(1.3, 2.1))
+        builder.put("plant", bush, pose(5.9 + 0.8 * math.cos(angle), 0.8 * math.sin(angle)), on=FLOOR)
     shape, surface = furniture.table(rng, 0.7, 0.5, 0.72)
     T = pose(5.9, 0.0, 0.0, rng.uniform(-math.pi, math.pi))
     id = builder.put("table", shape, T, on=FLOOR)
@@ -164,17 +152,13 @@ def _furnish(builder: Builder, rng: Rng, length: float, half: float) -> None:
                     "plant": lambda: furniture.plant(rng, rng.uniform(0.6, 1.2)),
                     "chair": lambda: furniture.chair(rng, swivel=False)[0],
                 }[name]()
-                put_on_floor(piece, name, thing, T)
+                piece.put(name, thing, T, on=FLOOR)
             builder.keep(piece)
 
 
 def _landmarks(rng: Rng, walls: list[Wall], length: float, half: float) -> Array:
     """Points on the walls of the hall, on its front and on the fences."""
-    points = [
-        wall.place(0.03, wall.length * share, rng.uniform(1.0, 2.2))[:3, 3]
-        for wall in walls
-        for share in (-0.33, 0.0, 0.33)
-    ]
+    points = marks_on(rng, walls, (-0.33, 0.0, 0.33), 1.0)
     for y in (-0.7 * half, 0.0, 0.7 * half):
         points += [np.array([side * 0.12, y, rng.uniform(1.2, 2.2)]) for side in (-1, 1)]
         points.append(np.array([length - 0.02, y, rng.uniform(0.6, 1.2)]))

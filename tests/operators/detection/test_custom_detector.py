@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_onnx import with_facts
 from typer.testing import CliRunner, Result
 
 from dataflow.messages import Image
@@ -154,20 +155,7 @@ def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path
 @pytest.mark.long
 def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) -> None:
     data, out = write_coco(tmp_path / "mine", 6), tmp_path / "mine.onnx"
-    options = [
-        "--epochs",
-        "1",
-        "--batch",
-        "4",
-        "--size",
-        "64x64",
-        "--width",
-        "0.25",
-        "--refiner-epochs",
-        "1",
-        "--out",
-        str(out),
-    ]
+    options = f"--epochs 1 --batch 4 --size 64x64 --width 0.25 --refiner-epochs 1 --out {out}".split()
     first = called("train", "detector", str(data), *options)
     assert first.exit_code == 0, first.stderr
     assert "CustomDetector" in first.stdout
@@ -278,10 +266,7 @@ def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fa
         (lambda c: c["annotations"].insert(1, None), r"annotations\.json: annotations\[1\] is None"),
         (lambda c: c["annotations"][0].update(image_id=[1]), r"annotations\[0\] .*image_id \[1\] is not among"),
         (lambda c: c["annotations"][0].update(category_id="ball"), r"category_id 'ball' is not among"),
-        (
-            lambda c: c["annotations"][0].update(bbox=[math.nan, 1, 2, 3]),
-            r"annotations\[0\] .*bbox is \[nan, 1,",
-        ),
+        (lambda c: c["annotations"][0].update(bbox=[math.nan, 1, 2, 3]), r"annotations\[0\] .*bbox is \[nan, 1,"),
         (lambda c: c["categories"][0].update(id="a"), r"annotations\.json: categories\[0\] .*an `id` \(an integer\)"),
     ],
 )
@@ -685,21 +670,17 @@ def test_a_file_of_another_kind_or_origin_is_refused_by_name(tmp_path: Path) -> 
     import onnx
 
     file, _ = exported(tmp_path)
-    model = onnx.load(str(file))
     for change, fault in (
         ({"kind": "segmenter"}, "is a segmenter; a detector is needed"),
         ({"width": 64}, r"must have one input tensor\(float\) \[1, 3, 128, 64\]"),
         ({"strides": [8, 16]}, "a stride for each level"),
     ):
-        facts = json.loads(model.metadata_props[0].value) | change
-        changed = onnx.ModelProto()
-        changed.CopyFrom(model)
-        onnx.helper.set_model_props(changed, {"dataflow.network": json.dumps(facts)})
-        onnx.save(changed, str(tmp_path / "changed.onnx"))
+        changed = with_facts(file, tmp_path / "changed.onnx", **change)
         with pytest.raises(NetworkFileError, match=fault):
-            CustomDetector(weights=str(tmp_path / "changed.onnx")).setup()
+            CustomDetector(weights=str(changed)).setup()
     with pytest.raises(NetworkFileError, match=r"activity\.onnx is an activity network; a detector is needed"):
         CustomDetector(weights=str(shipped("activity.onnx"))).setup()
+    model = onnx.load(str(file))
     del model.metadata_props[:]
     onnx.save(model, str(tmp_path / "bare.onnx"))
     with pytest.raises(NetworkFileError, match=r"no metadata .*OnnxDetector"):
@@ -709,13 +690,8 @@ def test_a_file_of_another_kind_or_origin_is_refused_by_name(tmp_path: Path) -> 
 
 
 def test_metadata_that_do_not_fit_the_output_are_named(tmp_path: Path) -> None:
-    import onnx
-
     file, _ = exported(tmp_path)
-    model = onnx.load(str(file))
-    facts = json.loads(model.metadata_props[0].value) | {"classes": ["one"]}
-    onnx.helper.set_model_props(model, {"dataflow.network": json.dumps(facts)})
-    onnx.save(model, str(file))
+    with_facts(file, file, classes=["one"])
     detector = CustomDetector(weights=str(file))
     detector.setup()
     with pytest.raises(NetworkFileError, match=r"does not fit its metadata: a map has shape \(1, 3 \* \(5 \+ 1\)"):

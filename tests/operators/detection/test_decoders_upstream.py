@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 
 from dataflow.messages import Detections2D, Image
 from operators.detection import OnnxDetector
@@ -38,27 +39,21 @@ def model_that_answers(
     size: tuple[int, int] = (SIDE, SIDE),
 ) -> str:
     """A model that gives these values whatever it sees; that named `sized` times its second input, (w, h)."""
-    make = onnx.helper
-    shapes = {"images": [1, 3, *size[::-1]]} | ({"orig_target_sizes": [1, 2]} if sized else {})
-    kinds = {"images": KINDS[kind], "orig_target_sizes": KINDS[sized_as]}
-    shapes = dict(reversed(shapes.items())) if sized_first else shapes
-    inputs = [make.make_tensor_value_info(n, getattr(onnx.TensorProto, kinds[n]), s) for n, s in shapes.items()]
-    nodes = [make.make_node("Identity", [f"{name}_values"], [name]) for name in outputs if name != sized]
+    inputs: dict[str, Any] = {"images": (KINDS[kind], [1, 3, *size[::-1]])}
+    if sized:
+        inputs["orig_target_sizes"] = (KINDS[sized_as], [1, 2])
+    if sized_first:
+        inputs = dict(reversed(inputs.items()))
+    nodes = [node("Identity", f"{name}_values", name) for name in outputs if name != sized]
     if sized:
         to = getattr(onnx.TensorProto, KINDS[outputs[sized].dtype.name])
         nodes += [
-            make.make_node("Concat", ["orig_target_sizes", "orig_target_sizes"], ["whole"], axis=1),
-            make.make_node("Cast", ["whole"], ["scale"], to=to),
-            make.make_node("Mul", [f"{sized}_values", "scale"], [sized]),
+            node("Concat", "orig_target_sizes orig_target_sizes", "whole", axis=1),
+            node("Cast", "whole", "scale", to=to),
+            node("Mul", f"{sized}_values scale", sized),
         ]
-    made = [
-        make.make_tensor_value_info(name, getattr(onnx.TensorProto, KINDS[value.dtype.name]), value.shape)
-        for name, value in outputs.items()
-    ]
-    values = [onnx.numpy_helper.from_array(value, f"{name}_values") for name, value in outputs.items()]
-    graph = make.make_graph(nodes, "answers", inputs, made, values)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return str(file)
+    made = {name: (KINDS[value.dtype.name], value.shape) for name, value in outputs.items()}
+    return write_model(file, nodes, inputs, made, values={f"{n}_values": value for n, value in outputs.items()})
 
 
 def found_by(model: str, decoder: str, names: Sequence[str], folder: Path, **params: Any) -> Detections2D:

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 
 from dataflow.messages import Detections2D, Image, Keypoints2D
 from operators.detection import KeypointDetector
@@ -37,32 +38,19 @@ def persons(scores: tuple[float, ...] = (0.9, 0.8, 0.7), classes: tuple[int, ...
     )
 
 
-def saved(
-    file: Path, shape: list[Any], kind: str, nodes: list[Any], outputs: dict[str, list[Any]], **values: Any
-) -> str:
-    make = onnx.helper
-    of = getattr(onnx.TensorProto, kind)
-    made = [make.make_tensor_value_info(name, onnx.TensorProto.FLOAT, each) for name, each in outputs.items()]
-    kept = [onnx.numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
-    graph = make.make_graph(nodes, "points", [make.make_tensor_value_info("input", of, shape)], made, kept)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return str(file)
-
-
 def simcc(file: Path, x: np.ndarray, y: np.ndarray, *, kind: str = "FLOAT", batch: bool = True) -> str:
     """A model of 48x64 pixels that answers x (K, Wx) and y (K, Wy) plus the mean of its input, for each image."""
-    make = onnx.helper
     nodes = [
-        make.make_node("Cast", ["input"], ["real"], to=onnx.TensorProto.FLOAT),
-        make.make_node("ReduceMean", ["real"], ["mean"], axes=[1, 2, 3], keepdims=1),
-        make.make_node("Squeeze", ["mean", "last"], ["each"]),
-        make.make_node("Add", ["x", "each"], ["simcc_x"]),
-        make.make_node("Add", ["y", "each"], ["simcc_y"]),
+        node("Cast", "input", "real", to=onnx.TensorProto.FLOAT),
+        node("ReduceMean", "real", "mean", axes=[1, 2, 3], keepdims=1),
+        node("Squeeze", "mean last", "each"),
+        node("Add", "x each", "simcc_x"),
+        node("Add", "y each", "simcc_y"),
     ]
     count = "n" if batch else 1
     outputs = {"simcc_x": [count, *x.shape], "simcc_y": [count, *y.shape]}
     values = {"x": x[None], "y": y[None], "last": np.array([3])}
-    return saved(file, [count, 3, 64, 48], kind, nodes, outputs, **values)
+    return write_model(file, nodes, {"input": (kind, [count, 3, 64, 48])}, outputs, values=values)
 
 
 def detector(**params: Any) -> KeypointDetector:
@@ -122,19 +110,18 @@ def test_simcc_as_in_mmpose(tmp_path: Path, kind: str, batch: bool) -> None:
 
 def movenet(file: Path, answer: np.ndarray) -> str:
     """A model of 64x64 pixels of int32 that answers (y, x, score), and as the last score the corner's red by 255."""
-    make = onnx.helper
     nodes = [
-        make.make_node("Slice", ["input", "begin", "end"], ["corner"]),
-        make.make_node("Cast", ["corner"], ["real"], to=onnx.TensorProto.FLOAT),
-        make.make_node("Div", ["real", "most"], ["share"]),
-        make.make_node("Concat", ["place", "share"], ["last"], axis=3),
-        make.make_node("Concat", ["rest", "last"], ["output"], axis=2),
+        node("Slice", "input begin end", "corner"),
+        node("Cast", "corner", "real", to=onnx.TensorProto.FLOAT),
+        node("Div", "real most", "share"),
+        node("Concat", "place share", "last", axis=3),
+        node("Concat", "rest last", "output", axis=2),
     ]
     values = {
         "begin": np.array([0, 0, 0, 0]), "end": np.array([1, 1, 1, 1]), "most": np.float32(255),
         "rest": answer[None, None, :-1], "place": answer[None, None, -1:, :2],
     }  # fmt: skip
-    return saved(file, [1, 64, 64, 3], "INT32", nodes, {"output": [1, 1, 17, 3]}, **values)
+    return write_model(file, nodes, {"input": ("INT32", [1, 64, 64, 3])}, {"output": [1, 1, 17, 3]}, values=values)
 
 
 def test_movenet_finds_the_person_of_the_whole_image(tmp_path: Path) -> None:

@@ -7,36 +7,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 
 from dataflow.messages import Image
 from operators.detection import CustomDetector, OnnxDetector
 from operators.inference import ModelError, open_content
 
-onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnx")
 
 
-def save_model(file: Path, output: np.ndarray, size: tuple[int | str, int | str] = (64, 64)) -> str:
+def save_model(file: Path, output: np.ndarray, size: tuple[int | str, int | str] = (64, 64), **metadata: str) -> str:
     """A model whose answer is `output` times the mean of its red channel (input channel 0), so it reads its input."""
-    make = onnx.helper
     nodes = [
-        make.make_node("Gather", ["x", "channel"], ["red"], axis=1),
-        make.make_node("ReduceMean", ["red"], ["mean"], keepdims=0),
-        make.make_node("Mul", ["rows", "mean"], ["y"]),
+        node("Gather", "x channel", "red", axis=1),
+        node("ReduceMean", "red", "mean", keepdims=0),
+        node("Mul", "rows mean", "y"),
     ]
-    graph = make.make_graph(
-        nodes,
-        "constant_boxes",
-        [make.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 3, *size])],
-        [make.make_tensor_value_info("y", onnx.TensorProto.FLOAT, output.shape)],
-        [
-            onnx.numpy_helper.from_array(output.astype(np.float32), "rows"),
-            onnx.numpy_helper.from_array(np.array([0]), "channel"),
-        ],
-    )
-    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(file))
-    return str(file)
+    values = {"rows": output.astype(np.float32), "channel": np.array([0])}
+    return write_model(file, nodes, {"x": [1, 3, *size]}, {"y": output.shape}, values=values, metadata=metadata)
 
 
 def yolov8_rows(*rows: tuple[float, ...]) -> np.ndarray:
@@ -194,10 +182,8 @@ def test_a_model_of_another_operator_and_a_file_of_no_row_are_refused(
 
 
 def test_class_names_are_those_of_the_models_metadata(tmp_path: Path) -> None:
-    file = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
-    model = onnx.load(file)
-    model.metadata_props.add(key="names", value="{0: 'crate', 1: 'pallet'}")
-    onnx.save(model, file)
+    rows = yolov8_rows((32, 32, 16, 32, 0.1, 0.9))
+    file = save_model(tmp_path / "m.onnx", rows, names="{0: 'crate', 1: 'pallet'}")
     assert detector(model=file, decoder="yolov8").process(red()).class_names == ("crate", "pallet")
 
 
@@ -229,24 +215,13 @@ def test_fastestdet_finds_what_is_in_real_photographs(data_dir: Path) -> None:
 def save_convolution(file: Path, side: int, *, fixed: bool) -> str:
     """A network of one convolution, exported for images of one side: the share of red in each 8x8 pixels is objectness
     and score of its cell. One that is `fixed` reshapes to the cells of that side."""
-    make, cells = onnx.helper, side // 8
+    cells = side // 8
     weights = np.zeros((6, 3, 8, 8), np.float32)
     weights[[0, 5], 2] = 1 / 64  # BGR in [0, 1]
-    shape = [1, 6, cells, cells] if fixed else [0, 0, 0, -1]
-    nodes = [
-        make.make_node("Conv", ["x", "weights"], ["grid"], kernel_shape=[8, 8], strides=[8, 8]),
-        make.make_node("Reshape", ["grid", "shape"], ["y"]),
-    ]
-    graph = make.make_graph(
-        nodes,
-        "convolution",
-        [make.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 3, side, side])],
-        [make.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1, 6, cells, cells])],
-        [onnx.numpy_helper.from_array(weights, "weights"), onnx.numpy_helper.from_array(np.array(shape), "shape")],
-        value_info=[make.make_tensor_value_info("grid", onnx.TensorProto.FLOAT, [1, 6, cells, cells])],
-    )
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return str(file)
+    values = {"weights": weights, "shape": np.array([1, 6, cells, cells] if fixed else [0, 0, 0, -1])}
+    nodes = [node("Conv", "x weights", "grid", kernel_shape=[8, 8], strides=[8, 8]), node("Reshape", "grid shape", "y")]
+    shapes = {"x": [1, 3, side, side]}, {"y": [1, 6, cells, cells]}
+    return write_model(file, nodes, *shapes, values=values, inner={"grid": shapes[1]["y"]})
 
 
 def test_a_network_of_convolutions_takes_a_larger_input_than_it_was_exported_for(tmp_path: Path) -> None:

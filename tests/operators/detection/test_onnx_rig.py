@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_onnx import node, write_model
 
 from dataflow.messages import Image
 from dataflow.testing import play
 from operators.detection import OnnxDetector, OnnxRigDetector
 from operators.inference import ModelError
 
-onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnx")
 
 CAMERAS = ("front", "left", "rear")
 
@@ -35,14 +36,13 @@ def network(
     With `joined` its answers are not apart by image, with `doubled` it gives each twice; `told` is the first extent of
     the output that it tells.
     """
-    make, real = onnx.helper, onnx.TensorProto.FLOAT
     nodes = [
-        make.make_node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3], keepdims=0),
-        make.make_node("Unsqueeze", ["mean", "behind"], ["share"]),
-        make.make_node("Mul", ["share", "factors"], ["scaled"]),
-        make.make_node("Add", ["scaled", "added"], ["row"]),
-        make.make_node("Reshape", ["row", "shape"], ["apart"]),
-        make.make_node("Concat", ["apart"] * (1 + doubled), ["output"], axis=0),
+        node("ReduceMean", "images", "mean", axes=[1, 2, 3], keepdims=0),
+        node("Unsqueeze", "mean behind", "share"),
+        node("Mul", "share factors", "scaled"),
+        node("Add", "scaled added", "row"),
+        node("Reshape", "row shape", "apart"),
+        node("Concat", "apart " * (1 + doubled), "output", axis=0),
     ]
     values = {
         "behind": np.array([1]),
@@ -50,13 +50,8 @@ def network(
         "added": np.array([16, 16, 12, 20, 0], np.float32),
         "shape": np.array([1, 5, -1] if joined else [-1, 5, 1]),
     }
-    count = "n" if batch else 1
-    shapes = {"images": [count, 3, 64, 64]}, {"output": [told if batch else 1, 5, "m"]}
-    ports = [[make.make_tensor_value_info(n, real, s) for n, s in each.items()] for each in shapes]
-    kept = [onnx.numpy_helper.from_array(value, name) for name, value in values.items()]
-    graph = make.make_graph(nodes, "mean", *ports, kept)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return str(file)
+    shapes = {"images": ["n" if batch else 1, 3, 64, 64]}, {"output": [told if batch else 1, 5, "m"]}
+    return write_model(file, nodes, *shapes, values=values)
 
 
 class Counted:
@@ -121,16 +116,10 @@ def test_a_network_that_does_not_tell_its_answers_apart_gets_each_image_alone(
 
 def test_rows_of_all_images_in_one_list_are_not_dealt_out_to_the_cameras(tmp_path: Path) -> None:
     """YOLOv7's export for a batch calls its list of boxes (N, 7) as long as the batch; two boxes are of two images."""
-    make, real = onnx.helper, onnx.TensorProto.FLOAT
     rows = np.array([[0, 4, 6, 40, 50, 0, 0.9], [0, 1, 1, 30, 20, 0, 0.8]], np.float32)
-    ports = [
-        [make.make_tensor_value_info(name, real, shape)]
-        for name, shape in (("images", ["batch", 3, 64, 64]), ("output", ["batch", 7]))
-    ]
-    kept = [onnx.numpy_helper.from_array(rows, "rows")]
-    graph = make.make_graph([make.make_node("Identity", ["rows"], ["output"])], "rows", *ports, kept)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), tmp_path / "m.onnx")
-    made = OnnxRigDetector(cameras=CAMERAS, model=str(tmp_path / "m.onnx"), decoder="end2end", classes="a")
+    ports = {"images": ["batch", 3, 64, 64]}, {"output": ["batch", 7]}
+    model = write_model(tmp_path / "m.onnx", [node("Identity", "rows", "output")], *ports, values={"rows": rows})
+    made = OnnxRigDetector(cameras=CAMERAS, model=model, decoder="end2end", classes="a")
     made.setup()
     found = made.process({each.frame: each for each in IMAGES[:2]})
     assert [found[f"detections_{k}"].count for k in (1, 2)] == [2, 2]

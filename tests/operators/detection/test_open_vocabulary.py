@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from made_towers import write_merges, write_open_detector
+from served_models import model_of, write_row
 
 from dataflow.messages import Image
 from dataflow.operator import ParameterError
@@ -30,28 +31,18 @@ def named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     cache.mkdir()
     merges = write_merges(cache / "open.tokenizer.txt")
     write_open_detector(cache / "open.onnx", merges, BOXES, COLORS)
-    row = {
-        "about": "colours",
-        "task": "detection",
-        "operator": "operators.detection:OnnxDetector",
+    fields: dict[str, Any] = {
+        "sha256": None,
+        "bytes": None,
         "params": {"decoder": "owlvit", "score_threshold": 0.5},
-        "input": "64x48 RGB",
-        "licence": {"code": "MIT", "weights": "MIT"},
-        "home": "here",
-        "published": "nothing",
-        "source": {"export": "by this test"},
-        "parts": {"tokenizer": {"source": {"url": f"file://{merges}"}, "sha256": _sha256(merges)}},
+        "parts": {
+            "tokenizer": {"source": {"url": f"file://{merges}"}, "sha256": sha256(merges.read_bytes()).hexdigest()}
+        },
     }
-    (tmp_path / "rows.yaml").write_text(json.dumps({"models": {"open": row}}))
+    write_row(tmp_path / "rows.yaml", model_of(b"any", "open", export="here"), **fields)
     monkeypatch.setenv("DATAFLOW_MODELS", str(tmp_path / "rows.yaml"))
     monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(cache))
     return "open"
-
-
-def _sha256(file: Path) -> str:
-    from hashlib import sha256
-
-    return sha256(file.read_bytes()).hexdigest()
 
 
 def detector(**params: Any) -> OnnxDetector:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from interrupted import trained_twice
 from numpy.typing import NDArray
 
 from dataflow.messages import Image
@@ -255,9 +255,7 @@ def test_a_detector_without_a_refiner_answers_as_its_first_look(refined: Refined
     assert np.array_equal(found.scores, first.scores)
 
 
-def test_a_detector_with_a_refiner_repeats_itself_and_keeps_to_its_threshold(
-    refined: Refined,
-) -> None:
+def test_a_detector_with_a_refiner_repeats_itself_and_keeps_to_its_threshold(refined: Refined) -> None:
     _, file, data = refined
     detectors = [CustomDetector(weights=str(file), score_threshold=threshold) for threshold in (0.0, 0.0, 0.3)]
     for each in detectors:
@@ -362,28 +360,8 @@ def test_what_is_learned_from_shows_the_objects_mirrored_or_not(refined: Refined
 def test_an_interrupted_training_ends_with_the_same_bits(refined: Refined, tmp_path: Path) -> None:
     plain, _, data = refined
     few = DetectionData(data.classes, data.training[:8], data.validation)
-
-    def task() -> RefinerTask:
-        return RefinerTask(few, plain, seed=2, variation=GENTLE)
-
-    through = Settings(epochs=2, batch=4, threads=1)
-    train(task(), through, tmp_path / "a.onnx")
-
-    class Interrupted(Exception):
-        pass
-
-    class Stops:
-        def begin(self, *_: int) -> None: ...
-        def step(self, epoch: int, losses: Mapping[str, float]) -> None:
-            if epoch == 1:
-                raise Interrupted
-
-        def epoch(self, *_: object) -> None: ...
-
-    with pytest.raises(Interrupted):
-        train(task(), through, tmp_path / "b.onnx", progress=Stops())
-    train(task(), through, tmp_path / "b.onnx", resume=True)
-    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    own = Settings(epochs=2, batch=4, threads=1)
+    trained_twice(lambda: RefinerTask(few, plain, seed=2, variation=GENTLE), own, tmp_path)
 
 
 @pytest.mark.long

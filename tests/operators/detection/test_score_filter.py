@@ -31,7 +31,7 @@ def test_each_detection_keeps_its_row_and_equal_to_the_limit_is_enough() -> None
     assert sure.visible is None
 
 
-def test_where_nothing_is_sure_an_empty_message_says_so() -> None:
+def test_where_nothing_is_sure_the_message_is_empty() -> None:
     assert ScoreFilter(min_score=1.0).process(FOUND).count == 0
 
 

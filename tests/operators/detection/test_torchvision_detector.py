@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from made_checkpoints import new_network, write_checkpoint
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image
@@ -24,14 +25,7 @@ CLASSES = ("__background__", "person", "mug", "N/A", "chair")
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small network with random weights and five classes of its own."""
-    torch.manual_seed(3)
-    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
-    for name, weight in model.named_parameters():
-        if "classification_head" in name and name.endswith("bias"):
-            torch.nn.init.normal_(weight, 0.0, 1.5)  # so that some boxes are sure
-    file = tmp_path_factory.mktemp("weights") / "mine.pt"
-    torch.save({"model": model.state_dict(), "classes": list(CLASSES)}, file)
-    return file
+    return write_checkpoint(tmp_path_factory.mktemp("weights") / "mine.pt", NAME, CLASSES)
 
 
 def image(seed: int = 0, *, gray: bool = False) -> Image:
@@ -46,7 +40,7 @@ def detector(checkpoint: Path, **params: object) -> TorchvisionDetector:
 
 def test_boxes_are_those_of_the_model_itself(checkpoint: Path) -> None:
     (found,) = play(detector(checkpoint), {"image": [image()]})["detections"]
-    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
+    model = new_network(NAME, CLASSES)
     model.load_state_dict(torch.load(checkpoint, weights_only=True)["model"])
     with torch.inference_mode():
         direct = model.eval()([torch.from_numpy(image().data.transpose(2, 0, 1)).float() / 255])[0]
@@ -122,7 +116,7 @@ def test_weights_of_another_model_or_no_weights_at_all_are_refused(checkpoint: P
     (tmp_path / "text.pt").write_text("no checkpoint")
     with pytest.raises(OperatorFailure, match=r"no checkpoint of torch\.save .* which are not read") as told:
         play(TorchvisionDetector(model=NAME, checkpoint=str(tmp_path / "text.pt")), {"image": [image()]})
-    assert "arbitrary code" not in str(told.value), "nobody is told how to run it"
+    assert "arbitrary code" not in str(told.value), "how to run it is not told"
 
 
 def test_half_precision_needs_a_gpu(checkpoint: Path) -> None:

@@ -7,10 +7,11 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from made_checkpoints import write_checkpoint
 
 import dataflow
 from dataflow.execution.failure import OperatorFailure
@@ -19,10 +20,6 @@ from dataflow.operator import Out
 from dataflow.testing import play
 from operators.detection import TorchvisionDetector, TorchvisionRigDetector
 from operators.segmentation import TorchvisionRigSegmenter, TorchvisionSegmenter
-
-if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
-    torch = pytest.importorskip("torch", reason="needs the extra [torch]")
-    models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 
 SSD, RCNN, LRASPP = (
     "ssdlite320_mobilenet_v3_large",
@@ -35,19 +32,8 @@ CAMERAS = ("front", "left", "rear")
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Small networks with random weights, of which those of the last layers are large, so that some boxes are sure."""
-    files = {}
-    for name in (SSD, RCNN, LRASPP):
-        torch.manual_seed(3)
-        model = models.get_model(name, weights=None, weights_backbone=None, num_classes=len(CLASSES))
-        for part, weight in model.named_parameters():
-            if "classification_head" in part and part.endswith("bias"):
-                torch.nn.init.normal_(weight, 0.0, 1.5)
-            if "cls_score" in part:
-                torch.nn.init.normal_(weight, 0.0, 0.5)
-        files[name] = str(tmp_path_factory.mktemp("weights") / f"{name}.pt")
-        torch.save({"model": model.state_dict(), "classes": list(CLASSES)}, files[name])
-    return files
+    folder = tmp_path_factory.mktemp("weights")
+    return {name: str(write_checkpoint(folder / f"{name}.pt", name, CLASSES)) for name in (SSD, RCNN, LRASPP)}
 
 
 def image(camera: str, stamp: int = 0, size: tuple[int, int] = (96, 128)) -> Image:

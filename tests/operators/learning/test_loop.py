@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from interrupted import trained_twice
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -16,7 +17,7 @@ if TYPE_CHECKING:  # imported before the first of these tests runs (tests/confte
 
     from operators.learning.backbone import MobileNetV2, load_backbone, start_from
     from operators.learning.files import TrainingFileError, load_safely, save_atomically
-    from operators.learning.loop import Settings, Silent, batches, schedule, train
+    from operators.learning.loop import Settings, batches, schedule, train
 
 
 class Line:
@@ -60,24 +61,6 @@ class Line:
         file.write_text(f"{facts['epoch']} {facts['scores']['score']}")
 
 
-class Stop(Exception):
-    """A crash at a chosen moment."""
-
-
-def crash(at: int, steps: int) -> Silent:
-    """Returns a progress that stops the training in a step of an epoch."""
-
-    class Crash(Silent):
-        left = steps
-
-        def step(self, epoch: int, losses: Mapping[str, float]) -> None:
-            self.left -= epoch == at
-            if epoch == at and self.left <= 0:
-                raise Stop
-
-    return Crash()
-
-
 def settings(**changes: Any) -> Settings:
     return Settings(**{"epochs": 6, "batch": 6, "learning_rate": 0.02, "threads": 1, "device": "cpu"} | changes)
 
@@ -91,13 +74,9 @@ def weights(file: Path) -> dict[str, Tensor]:
     ("epoch", "step"), [pytest.param(1, 1, marks=pytest.mark.long), (3, 3), pytest.param(5, 2, marks=pytest.mark.long)]
 )
 def test_a_run_that_was_interrupted_ends_with_the_same_bits(tmp_path: Path, epoch: int, step: int) -> None:
-    train(Line(), settings(), tmp_path / "whole.onnx")
-    with pytest.raises(Stop):
-        train(Line(), settings(), tmp_path / "halved.onnx", progress=crash(epoch, step))
-    outcome = train(Line(), settings(), tmp_path / "halved.onnx", resume=True)
+    outcome = trained_twice(Line, settings(), tmp_path, epoch, step)
     whole, halved = weights(tmp_path / "whole.pt"), weights(tmp_path / "halved.pt")
     assert all(torch.equal(whole[name], halved[name]) for name in whole)
-    assert (tmp_path / "whole.onnx").read_text() == (tmp_path / "halved.onnx").read_text()
     assert [row["epoch"] for row in outcome.history] == [1, 2, 3, 4, 5, 6]
 
 

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from made_towers import write_row
-from served_models import CONTENT, Served, model_of
+from made_towers import write_row as write_towers
+from served_models import CONTENT, Served, model_of, write_row
 from typer.testing import CliRunner
 
 from operators.models import registry
@@ -24,10 +24,8 @@ def run(*words: str) -> tuple[int, str, str]:
 @pytest.fixture
 def one(served: Served, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Served:
     """A registry of one's own with the row `net`, whose file the server has."""
-    row = model_of(CONTENT, url=served.url).model_dump(exclude_none=True)
-    file = tmp_path / "own.yaml"
-    file.write_text(json.dumps({"models": {row.pop("name"): row}}))
-    monkeypatch.setenv(registry.REGISTRIES, str(file))
+    own = write_row(tmp_path / "own.yaml", model_of(CONTENT, url=served.url))
+    monkeypatch.setenv(registry.REGISTRIES, own)
     return served
 
 
@@ -112,9 +110,7 @@ def test_get_replaces_a_damaged_file(one: Served, cache: Path) -> None:
 def test_get_of_a_damaged_file_that_is_exported_names_what_to_do(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = model_of(CONTENT, export="make it").model_dump(exclude_none=True)
-    (tmp_path / "own.yaml").write_text(json.dumps({"models": {row.pop("name"): row}}))
-    monkeypatch.setenv(registry.REGISTRIES, str(tmp_path / "own.yaml"))
+    monkeypatch.setenv(registry.REGISTRIES, write_row(tmp_path / "own.yaml", model_of(CONTENT, export="make it")))
     cache.mkdir()
     (cache / "net.onnx").write_bytes(CONTENT[:-1])
     code, _, err = run("get", "net")
@@ -143,7 +139,7 @@ def test_get_brings_the_parts_of_a_model_too_and_check_names_each(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = tmp_path / "made"
-    monkeypatch.setenv(registry.REGISTRIES, str(write_row(made)))
+    monkeypatch.setenv(registry.REGISTRIES, str(write_towers(made)))
     assert run("check", "colors")[:2] == (1, "colors: missing\ncolors.text: missing\ncolors.tokenizer: missing\n")
     code, out, _ = run("get", "colors")
     assert code == 0

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from served_models import model_of
+from made_onnx import node, write_model
+from served_models import model_of, write_row
 
 from dataflow.messages import Image, RelativeDepth, SegmentationMap
 from dataflow.operator import Operator
@@ -22,7 +22,7 @@ from operators.models import registry
 from operators.segmentation import OnnxSegmenter
 from operators.weights import shipped
 
-onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnx")
 
 IMAGE = Image(stamp=1, frame="camera", data=np.random.default_rng(2).integers(0, 256, (20, 30, 3)).astype(np.uint8))
 Registered = Callable[..., str]
@@ -30,17 +30,9 @@ Registered = Callable[..., str]
 
 def network(file: Path, planes: int, size: tuple[int | str, int | str] = ("h", "w")) -> Path:
     """A network that answers with the mean of the three channels, in so many planes."""
-    make, kind = onnx.helper, onnx.TensorProto.FLOAT
-    weights = onnx.numpy_helper.from_array(np.full((planes, 3, 1, 1), 1 / 3, np.float32), "w")
-    graph = make.make_graph(
-        [make.make_node("Conv", ["x", "w"], ["y"])],
-        "mean",
-        [make.make_tensor_value_info("x", kind, [1, 3, *size])],
-        [make.make_tensor_value_info("y", kind, None)],
-        [weights],
-    )
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(file))
-    return file
+    weights = np.full((planes, 3, 1, 1), 1 / 3, np.float32)
+    ports = {"x": [1, 3, *size]}, {"y": None}
+    return Path(write_model(file, [node("Conv", "x w", "y")], *ports, values={"w": weights}))
 
 
 @pytest.fixture
@@ -49,11 +41,10 @@ def registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registered:
 
     def write(operator: type[Operator], planes: int = 1, **fields: Any) -> str:
         file = network(tmp_path / "mine.onnx", planes)
-        row = model_of(file.read_bytes(), url="http://127.0.0.1:9/net.onnx").model_dump(exclude_none=True)
-        row |= {"operator": f"{operator.__module__}:{operator.__name__}", **fields}
+        row = model_of(file.read_bytes(), url="http://127.0.0.1:9/net.onnx")
         own = tmp_path / f"own{len(list(tmp_path.iterdir()))}.yaml"  # a file is read once
-        own.write_text(json.dumps({"models": {row.pop("name"): row}}))
-        monkeypatch.setenv(registry.REGISTRIES, str(own))
+        fields["operator"] = f"{operator.__module__}:{operator.__name__}"
+        monkeypatch.setenv(registry.REGISTRIES, write_row(own, row, **fields))
         return str(file)
 
     return write

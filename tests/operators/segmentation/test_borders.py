@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from interrupted import trained_twice
 from numpy.typing import NDArray
 
 from dataflow.messages import Image
@@ -290,20 +291,4 @@ def test_an_interrupted_training_ends_with_the_same_bits(
     plain, _, data = files
     few = SegmentationData(data.classes, data.training[:3], data.validation[:1])
     own = Settings(epochs=2, batch=4, threads=1)
-    train(BorderTask(few, plain, variation=GENTLE), own, tmp_path / "a.onnx")
-
-    class Interrupted(Exception):
-        pass
-
-    class Stops:
-        def begin(self, *_: int) -> None: ...
-        def step(self, epoch: int, losses: object) -> None:
-            if epoch == 1:
-                raise Interrupted
-
-        def epoch(self, *_: object) -> None: ...
-
-    with pytest.raises(Interrupted):
-        train(BorderTask(few, plain, variation=GENTLE), own, tmp_path / "b.onnx", progress=Stops())
-    train(BorderTask(few, plain, variation=GENTLE), own, tmp_path / "b.onnx", resume=True)
-    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    trained_twice(lambda: BorderTask(few, plain, variation=GENTLE), own, tmp_path)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import onnxruntime
 import pytest
+from made_onnx import node, write_model
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Image, SegmentationMap
@@ -35,29 +36,21 @@ def save(
     metadata: Mapping[str, str] | None = None,
 ) -> str:
     """A network whose scores are `weights` (C, 3) times the pixel, seen at every stride-th; inner type is float."""
-    make, types = onnx.helper, onnx.TensorProto
-    nodes = [make.make_node("Cast", ["x"], ["wide"], to=types.FLOAT)]
+    nodes = [node("Cast", "x", "wide", to=onnx.TensorProto.FLOAT)]
     if nhwc:
-        nodes.append(make.make_node("Transpose", ["wide"], ["image"], perm=[0, 3, 1, 2]))
-    nodes.append(make.make_node("Conv", ["image" if nhwc else "wide", "w"], ["planes"], strides=[stride, stride]))
+        nodes.append(node("Transpose", "wide", "image", perm=[0, 3, 1, 2]))
+    nodes.append(node("Conv", "image w" if nhwc else "wide w", "planes", strides=[stride, stride]))
     last = "planes"
     if argmax:
-        nodes.append(make.make_node("ArgMax", [last], ["best"], axis=1, keepdims=0))
         last = "best"
+        nodes.append(node("ArgMax", "planes", last, axis=1, keepdims=0))
     elif nhwc:
-        nodes.append(make.make_node("Transpose", [last], ["back"], perm=[0, 2, 3, 1]))
         last = "back"
-    graph = make.make_graph(
-        nodes,
-        "colours",
-        [make.make_tensor_value_info("x", getattr(types, kind), [1, *size, 3] if nhwc else [1, 3, *size])],
-        [make.make_tensor_value_info(last, types.INT64 if argmax else types.FLOAT, None)],
-        [onnx.numpy_helper.from_array(weights.astype(np.float32)[:, :, None, None], "w")],
-    )
-    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9)
-    onnx.helper.set_model_props(model, dict(metadata or {}))
-    onnx.save(model, str(file))
-    return str(file)
+        nodes.append(node("Transpose", "planes", last, perm=[0, 2, 3, 1]))
+    inputs = {"x": (kind, [1, *size, 3] if nhwc else [1, 3, *size])}
+    outputs = {last: ("INT64" if argmax else "FLOAT", None)}
+    values = {"w": weights.astype(np.float32)[:, :, None, None]}
+    return write_model(file, nodes, inputs, outputs, values=values, metadata=metadata)
 
 
 WEIGHTS = np.random.default_rng(5).normal(0, 2, (3, 3))
@@ -245,21 +238,12 @@ def test_what_does_not_fit_is_named(
 
 
 def test_a_network_that_is_no_segmenter_is_refused(tmp_path: Path) -> None:
-    make, types = onnx.helper, onnx.TensorProto
-    graph = make.make_graph(
-        [make.make_node("ReduceMean", ["x"], ["y"], keepdims=0)],
-        "mean",
-        [make.make_tensor_value_info("x", types.FLOAT, [1, 3, 8, 8])],
-        [make.make_tensor_value_info("y", types.FLOAT, None)],
-    )
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9), str(tmp_path / "m.onnx"))
+    flat = [node("ReduceMean", "x", "y", keepdims=0)]
+    mean = write_model(tmp_path / "m.onnx", flat, {"x": [1, 3, 8, 8]}, {"y": None})
     with pytest.raises(OperatorFailure, match=r"output 'y' of .*scores have shape \(1, classes, H, W\).*got \(\)"):
-        segmented(model=str(tmp_path / "m.onnx"))
-    flat = save(tmp_path / "g.onnx", WEIGHTS, size=(24, 32))
-    wrong = onnx.load(flat)
-    wrong.graph.input[0].type.tensor_type.elem_type = types.DOUBLE
-    onnx.save(wrong, flat)
-    made = OnnxSegmenter(model=flat)
+        segmented(model=mean)
+    double = write_model(tmp_path / "g.onnx", flat, {"x": ("DOUBLE", [1, 3, 24, 32])}, {"y": ("DOUBLE", None)})
+    made = OnnxSegmenter(model=double)
     with pytest.raises(ModelError, match=r"must have one input tensor\(float\) or .*\[1, 3, H, W\] or \[1, H, W, 3\]"):
         made.setup()
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from made_checkpoints import new_network, write_checkpoint
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Image, SegmentationMap
-from dataflow.testing import play
+from dataflow.messages import Image
+from dataflow.testing import Played, play
 from operators.segmentation import TorchvisionSegmenter
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     torch = pytest.importorskip("torch", reason="needs the extra [torch]")
-    models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
 
 NAME = "lraspp_mobilenet_v3_large"
 CLASSES = ("__background__", "floor", "wall")
@@ -23,11 +23,7 @@ CLASSES = ("__background__", "floor", "wall")
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(5)
-    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
-    file = tmp_path_factory.mktemp("weights") / "mine.pt"
-    torch.save({"model": model.state_dict(), "classes": list(CLASSES)}, file)
-    return file
+    return write_checkpoint(tmp_path_factory.mktemp("weights") / "mine.pt", NAME, CLASSES)
 
 
 def image(seed: int = 0) -> Image:
@@ -39,7 +35,7 @@ def image(seed: int = 0) -> Image:
 def test_classes_are_those_of_the_model_itself(checkpoint: Path) -> None:
     operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=64, with_confidence=True)
     (found,) = play(operator, {"image": [image()]})["segmentation"]
-    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
+    model = new_network(NAME, CLASSES)
     model.load_state_dict(torch.load(checkpoint, weights_only=True)["model"])
     preset = __import__("torchvision.transforms._presets", fromlist=["x"]).SemanticSegmentation(resize_size=64)
     with torch.inference_mode():
@@ -53,31 +49,16 @@ def test_classes_are_those_of_the_model_itself(checkpoint: Path) -> None:
 
 
 def test_unsure_pixels_become_void_and_equal_images_give_equal_maps(checkpoint: Path) -> None:
-    def run() -> list[str]:
-        operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=0, confidence_threshold=0.99)
-        played = play(operator, {"image": [image(1)]})
-        assert set(np.unique(played["segmentation"][0].classes)) == {255}
-        return played.digests()["segmentation"]
+    def run(**params: Any) -> Played:
+        operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=0, **params)
+        return play(operator, {"image": [image(1)]})
 
-    assert run() == run()
-
-
-@pytest.mark.long
-def test_a_class_may_have_a_threshold_of_its_own(checkpoint: Path) -> None:
-    def run(**params: object) -> SegmentationMap:
-        operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=0, with_confidence=True, **params)
-        return play(operator, {"image": [image(1)]})["segmentation"][0]
-
-    plain = run()
-    assert plain.confidence is not None
-    name = plain.class_names[np.bincount(plain.classes.reshape(-1)).argmax()]
-    strict = run(class_thresholds={name: float(np.median(plain.confidence))})
-    own = plain.classes == plain.class_names.index(name)
-    unsure = own & (plain.confidence < np.float32(np.median(plain.confidence)))
-    assert unsure.any()
-    np.testing.assert_array_equal(strict.classes == 255, unsure)
+    unsure = run(confidence_threshold=0.99)
+    assert set(np.unique(unsure["segmentation"][0].classes)) == {255}
+    assert run(confidence_threshold=0.99).digests() == unsure.digests()
     with pytest.raises(OperatorFailure, match=r"TorchvisionSegmenter\.class_thresholds has 'sky': 0\.5; it takes"):
         run(class_thresholds={"sky": 0.5})
+    assert 255 in run(class_thresholds={"background": 0.99})["segmentation"][0].classes
 
 
 def test_a_detection_model_is_no_segmentation_model() -> None:

@@ -4,29 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import made_robot
 import numpy as np
 import pytest
+from made_robot import OFF, QUIET, SMALL
 
-from dataflow.messages import Message
 from dataflow.messages.geometry import invert
 from dataflow.operator import ParameterError
 from operators.simulator import SimulatedRobot
 from operators.simulator.events import Fault, FaultPlan, changes
 from operators.simulator.settings import Lidar
 
-SMALL = {"width": 64, "height": 48}
-QUIET: dict[str, Any] = {"poses": 0, "boxes": False, "relations": 0, "activities": 0}
-OFF: dict[str, Any] = {"color_camera": {"rate": 0, **SMALL}, "depth_camera": {"rate": 0}, "truth": QUIET}
-
 
 def run(**params: Any) -> dict[str, list[Any]]:
-    robot = SimulatedRobot(**{**OFF, "seed": 4, "movers": False, **params})
-    robot.setup()
-    streams: dict[str, list[Message]] = {port: [m] for port, m in robot.static_outputs().items()}
-    for step in robot.stream():
-        for port, message in step.items():
-            streams.setdefault(port, []).append(message)
-    return streams
+    return made_robot.run(**{**OFF, "seed": 4, "movers": False, **params})
 
 
 def seconds(messages: list[Any]) -> np.ndarray:

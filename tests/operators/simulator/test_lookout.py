@@ -78,7 +78,7 @@ def test_the_heading_is_that_of_the_camera_whatever_its_mount() -> None:
 
 
 @pytest.mark.long
-def test_where_nobody_chooses_it_says_what_to_ask_for() -> None:
+def test_world_without_choosers_is_refused_with_what_to_ask_for() -> None:
     with pytest.raises(ValueError, match=r"no person here chooses .* give people: 3 or 4"):
         robot("office", 801, people=2)
 

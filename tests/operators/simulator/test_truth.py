@@ -368,19 +368,6 @@ def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
         assert {"sitting", "reaching", "drinking"} <= seen
 
 
-def test_a_hand_reaches_its_mug(robot: SimulatedRobot) -> None:
-    for thing in robot._stage.world.objects():
-        mover = thing.mover
-        if isinstance(mover, Person) and grasp_of(mover) is not None:
-            before = 0.0
-            for act in mover.timeline.acts:
-                if act.activity == "drinking" and act.lift == (0.0, 1.0):
-                    t = before - mover.timeline.phase + mover.timeline.period + 1e-3
-                    assert mover.held(t) == act.object
-                    assert np.linalg.norm(mover.grip(t) - act.grasp) < 0.05
-                before += act.seconds
-
-
 def test_activities_begin_when_they_say(steps: list[dict[str, Any]]) -> None:
     previous: dict[int, tuple[int, int]] = {}
     for message in (step["activities"] for step in steps if "activities" in step):

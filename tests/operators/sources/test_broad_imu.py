@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,7 +15,7 @@ from operators.sources import BroadImu
 from operators.sources.broad_imu import read_trial
 
 
-def trial(file: Path, **changes: object) -> Path:
+def trial(file: Path, rate: float | None = 200.0, **changes: object) -> Path:
     sets: dict[str, object] = {
         "imu_gyr": np.arange(12.0).reshape(4, 3),
         "imu_acc": np.ones((4, 3)),
@@ -24,7 +25,8 @@ def trial(file: Path, **changes: object) -> Path:
         "movement": np.array([False, True, True, True]),
     } | changes
     with h5py.File(file, "w") as made:
-        made.attrs["sampling_rate"] = 200.0
+        if rate is not None:
+            made.attrs["sampling_rate"] = rate
         for name, values in sets.items():
             if values is not None:
                 made[name] = values
@@ -32,7 +34,9 @@ def trial(file: Path, **changes: object) -> Path:
 
 
 def test_a_broad_trial_in_tesla_with_the_truth_of_its_movement(tmp_path: Path) -> None:
-    played = play(BroadImu(path=str(trial(tmp_path / "a.hdf5"))))
+    file = str(trial(tmp_path / "a.hdf5"))
+    played = play(BroadImu(path=file))
+    assert play(BroadImu(path=file)).digests() == played.digests()
     assert [m.stamp for m in played["imu"]] == [0, 5_000_000, 10_000_000, 15_000_000]
     assert [m.stamp for m in played["magnetic_field"]] == [0, 10_000_000, 15_000_000]
     np.testing.assert_allclose(played["magnetic_field"][0].field, [20e-6, 0, -40e-6])  # type: ignore[attr-defined]
@@ -52,35 +56,20 @@ def test_everything_known_is_given_if_asked(tmp_path: Path) -> None:
         ({"opt_quat": np.zeros((3, 4))}, r"opt_quat must have the shape \(4, 4\), got \(3, 4\)"),
         ({"movement": np.zeros(3, bool)}, r"movement must have the shape \(4,\)"),
         ({"imu_acc": np.full((4, 3), np.nan)}, "imu_acc is not finite at sample 0"),
+        *(({"rate": rate}, "sampling_rate must be a number above 0") for rate in (0.0, float("nan"), None)),
     ],
 )
-def test_a_wrong_broad_file_is_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
+def test_a_wrong_broad_file_is_named(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(SourceError, match=words):
         read_trial(trial(tmp_path / "a.hdf5", **changes))
 
 
 def test_what_is_no_broad_file_is_named(tmp_path: Path) -> None:
-    text = tmp_path / "a.hdf5"
-    text.write_text("words")
+    (tmp_path / "a.hdf5").write_text("words")
     with pytest.raises(SourceError, match="no HDF5 file"):
-        read_trial(text)
-    with h5py.File(text, "w") as made:
-        made["imu_gyr"] = np.zeros((1, 3))
-    with pytest.raises(SourceError, match="no data set 'imu_acc'"):
-        read_trial(text)
+        read_trial(tmp_path / "a.hdf5")
     with pytest.raises(SourceError, match="start=9, stop=None leaves none"):
         BroadImu(path=str(trial(tmp_path / "b.hdf5")), start=9).setup()
-
-
-@pytest.mark.parametrize("rate", [0.0, float("nan"), None], ids=["zero", "not finite", "missing"])
-def test_a_wrong_sampling_rate_is_named(tmp_path: Path, rate: float | None) -> None:
-    file = trial(tmp_path / "a.hdf5")
-    with h5py.File(file, "a") as content:
-        del content.attrs["sampling_rate"]
-        if rate is not None:
-            content.attrs["sampling_rate"] = rate
-    with pytest.raises(SourceError, match="sampling_rate must be a number above 0"):
-        read_trial(file)
 
 
 def test_a_part_of_a_trial_keeps_its_stamps(tmp_path: Path) -> None:
@@ -88,11 +77,6 @@ def test_a_part_of_a_trial_keeps_its_stamps(tmp_path: Path) -> None:
     played = play(source)
     assert [m.stamp for m in played["imu"]] == [10_000_007, 15_000_007]
     assert source.length() == 2
-
-
-def test_two_plays_of_a_broad_trial_give_equal_bits(tmp_path: Path) -> None:
-    file = str(trial(tmp_path / "a.hdf5"))
-    assert play(BroadImu(path=file)).digests() == play(BroadImu(path=file)).digests()
 
 
 @pytest.mark.data

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import socket
-from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import reduce
 from itertools import pairwise
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plugged import Cable, free_port, send_datagrams, while_opened
 
 from dataflow.messages import NavSatFix
 from dataflow.operator import SourceError
@@ -232,51 +231,16 @@ def test_a_log_without_positions_is_explained(content: bytes, finding: str, tmp_
     assert bool(finding) == bool(source.finding())
 
 
-class Cable:
-    """A pseudo-terminal that is plugged in at a path, and pulled out."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def plug(self) -> None:
-        self.end, device = os.openpty()
-        self.path.symlink_to(os.ttyname(device))
-        os.close(device)
-
-    def send(self, data: bytes) -> None:
-        assert os.write(self.end, data) == len(data)
-
-    def pull(self) -> None:
-        self.path.unlink()
-        os.close(self.end)
-
-
-class Scripted(NmeaGnss):
-    """A receiver before and after each of whose openings something is done."""
-
-    acts: Iterator[tuple[Callable[[], None], Callable[[], None]]]
-
-    def _open(self) -> int:
-        before, after = next(self.acts)
-        before()
-        port = super()._open()
-        after()
-        return port
-
-
-def nothing() -> None:
-    pass
-
-
 def test_a_receiver_that_is_unplugged_goes_on_when_it_is_back(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     cable = Cable(tmp_path / "usb-receiver")
-    source = Scripted(input=str(cable.path), baud=115200, clock="receiver")
-    source.acts = iter(
+    source = NmeaGnss(input=str(cable.path), baud=115200, clock="receiver")
+    while_opened(
+        source,
         [
             (cable.plug, lambda: cable.send(b"\x03half a line\r\n" + rmc("120000") + gga("120001") + GOOD[:25])),
-            (nothing, nothing),  # it is not there yet
+            (bytes, bytes),  # it is not there yet
             (cable.plug, lambda: cable.send(GOOD[25:] + gga("120005"))),
-        ]
+        ],
     )
     source.setup()
     fixes = source.stream()
@@ -288,12 +252,7 @@ def test_a_receiver_that_is_unplugged_goes_on_when_it_is_back(tmp_path: Path, ca
     assert list(fixes) == []
     source.close()
     assert second.stamp - first.stamp == 4 * 10**9
-    assert source.summary() == {
-        "clock": "receiver",
-        "sentences": "GGA 2, RMC 1",
-        "bad_sentences": 1,
-        "unplugged": 1,
-    }
+    assert source.summary() == {"clock": "receiver", "sentences": "GGA 2, RMC 1", "bad_sentences": 1, "unplugged": 1}
     [warning] = [record for record in caplog.records if record.levelname == "WARNING"]
     assert "is gone" in warning.getMessage()
     os.close(cable.end)
@@ -321,17 +280,13 @@ def test_pauses_between_looks_are_bounded(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_datagrams_are_stamped_by_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     source = NmeaGnss(input=f"udp://127.0.0.1:{port}")
     source.setup()
     times = iter((100, 200, 300))
     monkeypatch.setattr("operators.sources.ports.time.time_ns", lambda: next(times))
     fixes = source.stream()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in (b"", gga("120000"), b"garbage" + gga("120001")):
-            sender.sendto(datagram, ("127.0.0.1", port))
+    send_datagrams(port, b"", gga("120000"), b"garbage" + gga("120001"))
     stamps = [next(fixes)["fix"].stamp for _ in range(2)]
     source.stop_reading()
 

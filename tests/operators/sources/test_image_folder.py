@@ -171,20 +171,13 @@ def test_images_that_are_late_or_damaged_are_left_out(tmp_path: Path, caplog: py
 
     assert shown(source) == [(5, 0), (7, 3)]
     assert source.summary()["left_out"] == 3
+    assert "3 images of" in source.finding()
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert sorted(warning.split(" is left out: ")[0] for warning in warnings) == [
         "image 4.png",
         "image 6.png",
         "image thumbnail.png",
     ]
-
-
-def test_images_that_were_left_out_are_a_finding(tmp_path: Path) -> None:
-    fill(tmp_path, "1.png")
-    source = growing(tmp_path, nothing, write("2.png", b"damaged"), nothing, write("3.png", encoded(3)), nothing)
-
-    assert shown(source) == [(1, 0), (3, 3)]
-    assert "1 image of" in source.finding()
 
 
 def test_a_file_that_never_settles_does_not_hold_the_others(tmp_path: Path) -> None:

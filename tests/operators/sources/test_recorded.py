@@ -184,11 +184,7 @@ CASES = [
         lambda k: [2e-5, 0, -4e-5 - 1e-6 * k],
     ),
     Case(
-        "RecordedPose",
-        "odometry",
-        odometry,
-        lambda m: [*m.position, *m.linear],
-        lambda k: [k, -1, 0.5, 0.1 * k, 0, 0],
+        "RecordedPose", "odometry", odometry, lambda m: [*m.position, *m.linear], lambda k: [k, -1, 0.5, 0.1 * k, 0, 0]
     ),
     Case(
         "RecordedPose",

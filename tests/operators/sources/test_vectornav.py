@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import socket
-from collections.abc import Callable, Iterator
 from functools import reduce
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plugged import Cable, free_port, send_datagrams, while_opened
 
 from dataflow.operator import SourceError
 from operators.sources import VectorNavImu
@@ -30,39 +29,6 @@ def imu(gyro: str = "+00.100,-00.200,+00.300") -> bytes:
 
 def ymr(more: str = "") -> bytes:
     return message(f"VNYMR,+010.0,+000.1,-000.2,+00.1,+00.2,-00.3,+01.0,-02.0,-09.8,+00.1,-00.2,+00.3{more}")
-
-
-class Cable(VectorNavImu):
-    """An IMU at a pseudo-terminal, before and after each of whose openings something is done."""
-
-    acts: Iterator[tuple[Callable[[], None], Callable[[], None]]]
-
-    def _open(self) -> int:
-        before, after = next(self.acts)
-        before()
-        port = super()._open()
-        after()
-        return port
-
-
-@pytest.fixture
-def cable(tmp_path: Path) -> Iterator[tuple[Path, Callable[[], None], Callable[[bytes], None], Callable[[], None]]]:
-    """The path of a pseudo-terminal, and what plugs it in, sends through it and pulls it out."""
-    path, ends = tmp_path / "imu", list[int]()
-
-    def plug() -> None:
-        end, device = os.openpty()
-        path.symlink_to(os.ttyname(device))
-        os.close(device)
-        ends.append(end)
-
-    def pull() -> None:
-        path.unlink()
-        os.close(ends.pop())
-
-    yield path, plug, lambda data: (os.write(ends[-1], data), None)[1], pull
-    for end in ends:
-        os.close(end)
 
 
 def read(*chunks: bytes, **params: int | str) -> tuple[list, VectorNavImu]:
@@ -125,28 +91,27 @@ def test_stamps_are_the_machines_clock_less_the_latency() -> None:
     assert source.summary()["clock"] == "machine"
 
 
-def test_an_imu_that_is_unplugged_goes_on_when_it_is_back(
-    cable: tuple[Path, Callable[[], None], Callable[[bytes], None], Callable[[], None]],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    path, plug, send, pull = cable
-    source = Cable(input=str(path))
-    source.acts = iter(
+def test_an_imu_that_is_unplugged_goes_on_when_it_is_back(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cable = Cable(tmp_path / "imu")
+    source = VectorNavImu(input=str(cable.path))
+    while_opened(
+        source,
         [
-            (plug, lambda: send(imu() + imu()[:30])),
-            (lambda: None, lambda: None),  # it is not there yet
-            (plug, lambda: send(imu()[30:] + imu("+00.5,0,0"))),
-        ]
+            (cable.plug, lambda: cable.send(imu() + imu()[:30])),
+            (bytes, bytes),  # it is not there yet
+            (cable.plug, lambda: cable.send(imu()[30:] + imu("+00.5,0,0"))),
+        ],
     )
     source.setup()
     steps = source.stream()
     first = next(steps)["imu"]
-    pull()
+    cable.pull()
     second = next(steps)["imu"]
     source.stop_reading()
 
     assert list(steps) == []
     source.close()
+    os.close(cable.end)
     assert first.angular_velocity[0] == 0.1  # type: ignore[union-attr]
     assert second.angular_velocity[0] == 0.5  # type: ignore[union-attr]
     assert source.summary() == {
@@ -156,14 +121,10 @@ def test_an_imu_that_is_unplugged_goes_on_when_it_is_back(
 
 
 def test_datagrams_are_read() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     source = VectorNavImu(input=f"udp://127.0.0.1:{port}")
     source.setup()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in (b"", REAL):
-            sender.sendto(datagram, ("127.0.0.1", port))
+    send_datagrams(port, b"", REAL)
     assert next(source.stream())["imu"].temperature == 20.7  # type: ignore[union-attr]
     source.close()
 

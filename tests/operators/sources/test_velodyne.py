@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import socket
 import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plugged import free_port, send_datagrams
 
 from dataflow.messages import PointCloud
 from dataflow.operator import SourceError
@@ -90,12 +90,6 @@ def test_the_sensors_clock_gives_the_time_within_the_hour(tmp_path: Path) -> Non
 
 
 @need
-def test_a_capture_that_breaks_off_gives_what_it_holds(tmp_path: Path) -> None:
-    clouds = play(VelodyneFile(input=str(capture(tmp_path / "a.pcap", [packet(k) for k in range(160)], cut=1250))))
-    assert len(clouds["cloud"]) == 3
-
-
-@need
 def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) -> None:
     whole = capture(tmp_path / "a.pcap", [packet(k) for k in range(160)])
     data, record = whole.read_bytes(), 16 + 42 + 1206
@@ -106,7 +100,7 @@ def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) ->
     ):
         (tmp_path / f"{name}.pcap").write_bytes(content)
         source = VelodyneFile(input=str(tmp_path / f"{name}.pcap"))
-        assert play(source)["cloud"]
+        assert len(play(source)["cloud"]) == (2 if name != "cut" else 3)
         assert why in source.finding()
     source = VelodyneFile(input=str(whole))
     play(source)
@@ -114,13 +108,19 @@ def test_a_capture_that_breaks_off_or_is_damaged_is_a_finding(tmp_path: Path) ->
 
 
 @need
-@pytest.mark.parametrize(("magic", "advice"), [(b"\n\r\r\n", "editcap -F pcap"), (b"\x1f\x8b", "gunzip")])
-def test_captures_of_other_kinds_are_named(magic: bytes, advice: str, tmp_path: Path) -> None:
-    (tmp_path / "a.pcap").write_bytes(magic + bytes(100))
-    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
-    source.setup()
-    with pytest.raises(SourceError, match=advice):
-        list(source.stream())
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\n\r\r\n" + bytes(100), "editcap -F pcap"),
+        (b"\x1f\x8b" + bytes(100), "gunzip"),
+        (b"", "is no capture of packets"),
+        (b"no capture at all, but a longer text than a header", "is no capture of packets"),
+    ],
+)
+def test_a_file_that_is_no_capture_is_named(content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.pcap").write_bytes(content)
+    with pytest.raises(Exception, match=words):
+        play(VelodyneFile(input=str(tmp_path / "a.pcap")))
 
 
 @need
@@ -168,16 +168,6 @@ def test_packets_of_another_sensors_model_are_left_out(tmp_path: Path, caplog: p
 
 
 @need
-@pytest.mark.parametrize("content", [b"", b"no capture at all, but a longer text than a header"])
-def test_a_file_that_is_no_capture_is_named(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.pcap").write_bytes(content)
-    source = VelodyneFile(input=str(tmp_path / "a.pcap"))
-    source.setup()
-    with pytest.raises(SourceError, match="is no capture of packets"):
-        list(source.stream())
-
-
-@need
 def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.LogCaptureFixture) -> None:
     source = VelodyneLidar(input="udp://127.0.0.1:2368")
     times = iter([*((START * 10**9 + round(k * EVERY * 1e9), packet(k)) for k in range(100))])
@@ -206,9 +196,7 @@ def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.
 
 
 def over_loopback() -> tuple[VelodyneLidar, int]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     source = VelodyneLidar(input=f"udp://127.0.0.1:{port}")
     source.setup()
     return source, port
@@ -217,10 +205,7 @@ def over_loopback() -> tuple[VelodyneLidar, int]:
 @need
 def test_datagrams_of_loopback_become_clouds() -> None:
     source, port = over_loopback()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for k in range(90):
-            sender.sendto(packet(k), ("127.0.0.1", port))
-        sender.sendto(b"position", ("127.0.0.1", port))
+    send_datagrams(port, *(packet(k) for k in range(90)), b"position")
     cloud = next(source.stream())["cloud"]
     source.close()
 
@@ -235,9 +220,7 @@ def test_packets_wait_for_a_late_graph_and_those_without_room_are_counted(
 ) -> None:
     monkeypatch.setattr(ports, "BUFFER", buffer)
     source, port = over_loopback()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for k in range(150):
-            sender.sendto(packet(k), ("127.0.0.1", port))
+    send_datagrams(port, *(packet(k) for k in range(150)))
     kept = 0
     while ports.read_port(source._port)[0] is not None:
         kept += 1

@@ -57,11 +57,6 @@ def test_sightings_belong_to_their_pose(file: Path) -> None:
     assert steps[2]["sightings"].ids.tolist() == [7, 8]  # type: ignore[attr-defined]
 
 
-def test_reading_twice_gives_equal_bits(file: Path) -> None:
-    digests = [[m.digest() for step in steps_of(file) for m in step.values()] for _ in range(2)]  # type: ignore[attr-defined]
-    assert digests[0] == digests[1]
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [

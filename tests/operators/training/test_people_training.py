@@ -141,20 +141,14 @@ def test_unknown_is_a_miss_and_false_for_no_class() -> None:
     assert macro_f1(["a", "a", "b", "b"], ["a", "unknown", "b", "b"]) == pytest.approx((2 / 3 + 1) / 2)
     assert macro_f1(["a", "b"], ["a", "a"]) == pytest.approx((2 / 3) / 2)
     assert macro_f1([], []) == 0
-
-
-def test_a_class_that_is_said_and_never_true_counts_nought() -> None:
-    assert macro_f1(["a", "a", "a"], ["a", "a", "b"]) == pytest.approx((4 / 5 + 0) / 2)
+    assert macro_f1(["a", "a", "a"], ["a", "a", "b"]) == pytest.approx((4 / 5 + 0) / 2)  # said, and never true
 
 
 def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     folder, out = tmp_path / "silhouettes", tmp_path / "posture.onnx"
     folder.mkdir()
-    for kind, seed, people in (
-        *worlds(simulated_postures.TRAINING, 2),
-        *worlds(simulated_postures.VALIDATION, 1),
-    ):
+    for kind, seed, people in (*worlds(simulated_postures.TRAINING, 2), *worlds(simulated_postures.VALIDATION, 1)):
         activities = np.arange(21) % len(POSTURES)
         shapes = np.zeros((21, 3, SIDE, SIDE), np.int8)
         for shape, activity in zip(shapes, activities, strict=True):
@@ -162,21 +156,8 @@ def test_the_posture_network_is_trained_scored_and_written(tmp_path: Path) -> No
         Postures(shapes, rng.normal(0, 0.3, (21, BODY)).astype(np.float32), activities).write(
             folder / f"{kind}_{seed}_{people}.npz"
         )
-    words = [
-        "posture",
-        str(folder),
-        "--out",
-        str(out),
-        "--worlds",
-        "2",
-        "--validation",
-        "1",
-        "--epochs",
-        "2",
-        "--batch",
-        "8",
-    ]
-    done = CliRunner().invoke(train, [*words, "--json"])
+    words = f"posture {folder} --out {out} --worlds 2 --validation 1 --epochs 2 --batch 8 --json"
+    done = CliRunner().invoke(train, words.split())
     assert done.exit_code == 0, done.output
     assert 0 <= json.loads(done.stdout)["scores"]["score"] <= 1
     assert trained_in_simulation(out)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+from interrupted import Interrupted, interrupted
 from typer.testing import CliRunner
 
 from dataflow.messages import Image
@@ -24,7 +25,7 @@ if TYPE_CHECKING:  # imported before the first of these tests runs (tests/confte
     torch = pytest.importorskip("torch", reason="training needs the extra [train]")
     pytest.importorskip("torchvision", reason="needs the extra [torch]")
     from operators.learning.files import TrainingFileError, load_safely
-    from operators.learning.loop import Settings, Silent
+    from operators.learning.loop import Settings
     from operators.learning.loop import train as loop
     from operators.training.torchvision_tasks import TorchvisionDetectorTask, weights_in
 
@@ -120,13 +121,9 @@ def test_a_run_that_was_resumed_ends_with_the_same_bits(data: Path, tmp_path: Pa
     def task() -> TorchvisionDetectorTask:
         return TorchvisionDetectorTask(read_detection_data(data), DETECTOR, (96, 64), variation=NONE)
 
-    class Interrupted(Silent):
-        def epoch(self, epoch: int, losses: object, scores: object) -> None:
-            raise KeyboardInterrupt
-
     loop(task(), settings, tmp_path / "whole.pth")
-    with pytest.raises(KeyboardInterrupt):
-        loop(task(), settings, tmp_path / "halved.pth", progress=Interrupted())
+    with pytest.raises(Interrupted):
+        loop(task(), settings, tmp_path / "halved.pth", progress=interrupted(2))
     loop(task(), settings, tmp_path / "halved.pth", resume=True)
     whole, halved = (load_safely(tmp_path / f"{name}.pth")["model"] for name in ("whole", "halved"))
     assert all(torch.equal(whole[name], halved[name]) for name in whole)

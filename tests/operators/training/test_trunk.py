@@ -97,14 +97,7 @@ def test_what_cannot_share_is_told_and_leaves_no_file(trained: Path, apart: Path
 
 
 def test_the_command_writes_both_files_and_replaces_none(apart: Path, tmp_path: Path) -> None:
-    words = [
-        "train",
-        "trunk",
-        str(apart / "detector.onnx"),
-        str(apart / "segmenter.onnx"),
-        "--out",
-        str(tmp_path / "new"),
-    ]
+    words = f"train trunk {apart / 'detector.onnx'} {apart / 'segmenter.onnx'} --out {tmp_path / 'new'}".split()
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     detector, segmenter = opened(tmp_path / "new")

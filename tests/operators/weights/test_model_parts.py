@@ -6,31 +6,25 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from made_onnx import node, onnx_model
 from numpy.typing import NDArray
 
 from operators.inference import open_content
 from operators.weights.model_parts import ModelParts, Value
 
-onnx = pytest.importorskip("onnx", reason="models are made with the extra [train]")
+pytest.importorskip("onnx", reason="models are made with the extra [train]")
 
 
 def model(weight: float = 2.0, words: str = "", operation: str = "Add") -> bytes:
     """image → middle = weight x image, side = middle + 1 → answer = relu(middle) + side; `words` end inner names."""
-    make, middle, side = onnx.helper.make_node, f"middle{words}", f"side{words}"
     nodes = [
-        make("Mul", ["image", f"weight{words}"], [middle]),
-        make(operation, [middle, f"one{words}"], [side]),
-        make("Relu", [middle], [f"positive{words}"]),
-        make("Add", [f"positive{words}", side], ["answer"]),
+        node("Mul", f"image weight{words}", f"middle{words}"),
+        node(operation, f"middle{words} one{words}", f"side{words}"),
+        node("Relu", f"middle{words}", f"positive{words}"),
+        node("Add", f"positive{words} side{words}", "answer"),
     ]
-    constants = [
-        onnx.numpy_helper.from_array(np.array(value, np.float32), name)
-        for value, name in ((weight, f"weight{words}"), (1.0, f"one{words}"))
-    ]
-    ends = [onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, [1, 3]) for n in ("image", "answer")]
-    graph = onnx.helper.make_graph(nodes, f"graph{words}", ends[:1], ends[1:], constants)
-    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9)
-    onnx.helper.set_model_props(made, {"key": "kept"})
+    values = {f"weight{words}": np.float32(weight), f"one{words}": np.float32(1)}
+    made = onnx_model(nodes, {"image": [1, 3]}, {"answer": [1, 3]}, values, {"key": "kept"})
     content: bytes = made.SerializeToString()
     return content
 
@@ -68,9 +62,9 @@ def test_a_part_takes_what_it_needs_and_gives_more_where_asked() -> None:
 
 
 def test_a_digest_is_of_the_arithmetic_and_not_of_names() -> None:
-    plain, renamed = ModelParts(model()), ModelParts(model(words=" of another file"))
+    plain, renamed = ModelParts(model()), ModelParts(model(words="_of_another_file"))
     for name in ("middle", "side", "positive"):
-        assert plain.digest([name]) == renamed.digest([f"{name} of another file"])
+        assert plain.digest([name]) == renamed.digest([f"{name}_of_another_file"])
     assert plain.digest(["middle"]) == ModelParts(model(operation="Sub")).digest(["middle"])
     assert plain.digest(["side"]) != ModelParts(model(operation="Sub")).digest(["side"])
     assert plain.digest(["middle"]) != ModelParts(model(weight=2.5)).digest(["middle"])
