@@ -43,7 +43,7 @@ def evaluate_detector(
       dataflow evaluate detector DATA --weights out/mine.onnx --all --json
     """
     with friendly():
-        from operators.detection.custom.assessment import assess
+        from operators.detection.assessment import assess
         from operators.detection.custom.folder import read_detection_data
 
         assessed = _assessed(read_detection_data, assess, data, weights, everything, seed, json)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.custom.assessment import assess as assess_detector
+from operators.detection.assessment import assess as assess_detector
 from operators.detection.custom.folder import read_detection_data
 from operators.learning.augmentation import fitted, tensor_of, warp
 from operators.learning.files import whole

@@ -15,6 +15,8 @@ from source_trees import nodes_of
 MOST_ON_A_FLOOR = 25
 MOST_IN_A_FOLDER = 25
 MOST_ARROWS_IN_ODOMETRY = 40
+CIRCULAR = ("dataflow.cli",)
+"""Rooms whose folders import each other."""
 MOST_LINES = 60
 LONG = {
     "dataflow.cli.commands.convert:convert": 92,
@@ -159,8 +161,9 @@ def test_no_room_is_a_warehouse(repository: Path) -> None:
         while left:
             floor = {name for name, others in left.items() if not others & left.keys()}
             assert len(floor) <= MOST_ON_A_FLOOR, f"{room}: {len(floor)} on one floor: {sorted(floor)}"
-            if not floor:  # folders that import each other, by modules that do not
+            if room in CIRCULAR and not floor:
                 break
+            assert floor, f"{room}: these import each other, by modules that do not: {sorted(left)}"
             left = {name: others for name, others in left.items() if name not in floor}
     odometry = sum(len(others) for others in inside_of("operators.odometry", between).values())
     assert odometry <= MOST_ARROWS_IN_ODOMETRY
