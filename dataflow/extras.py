@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import re
 import traceback
 from functools import cache
@@ -25,15 +26,21 @@ _BY_CALLER = {
 }
 """Package of the importing module → the extra that serves it, where several extras bring what is missing."""
 
-_REQUIREMENT = re.compile(r"([\w.-]+)[^;]*;.*extra\s*==\s*['\"](\w+)['\"]")
+_REQUIREMENT = re.compile(r"([\w.-]+)[^;]*;\s*(?:(.*)\s+and\s+)?extra\s*==\s*['\"](\w+)['\"]")
 
 
 def missing_extra(error: BaseException | None) -> str:
-    """Returns "it comes with: pip install ..." for an error that a missing package caused; "" if no extra has it."""
+    """Returns "it comes with: pip install ..." for an error that a missing package caused; "" if no extra has it.
+
+    Where the package has no build for processors as this one with every Python, that condition is given, too.
+    """
     while error is not None:
         if isinstance(error, ModuleNotFoundError) and error.name:
-            extras = _extras().get(_distribution(error.name), ())
-            return f"{INSTALL} '{DISTRIBUTION}[{_chosen(extras, error)}]'" if extras else ""
+            if not (extras := _extras().get(_distribution(error.name))):
+                return ""
+            extra = _chosen(tuple(extras), error)
+            where = f", where {extras[extra]}" if platform.machine() in extras[extra] else ""
+            return f"{INSTALL} '{DISTRIBUTION}[{extra}]'{where}"
         error = error.__cause__ or error.__context__
     return ""
 
@@ -49,18 +56,19 @@ def _distribution(module: str) -> str:
 
 
 @cache
-def _extras() -> dict[str, tuple[str, ...]]:
+def _extras() -> dict[str, dict[str, str]]:
+    """Returns, by distribution, the extras that bring it, sorted, each with the condition under which it does."""
     from importlib.metadata import PackageNotFoundError, requires  # a command that lacks nothing need not load it
 
     try:
         declared = requires(DISTRIBUTION) or []
     except PackageNotFoundError:
         return {}
-    found: dict[str, set[str]] = {}
+    found: dict[str, dict[str, str]] = {}
     for text in declared:
-        if (match := _REQUIREMENT.match(text)) and match[2] not in _COLLECTIONS and match[1] != DISTRIBUTION:
-            found.setdefault(match[1], set()).add(match[2])
-    return {name: tuple(sorted(extras)) for name, extras in found.items()}
+        if (match := _REQUIREMENT.match(text)) and match[3] not in _COLLECTIONS and match[1] != DISTRIBUTION:
+            found.setdefault(match[1], {})[match[3]] = (match[2] or "").strip("()")
+    return {name: dict(sorted(extras.items())) for name, extras in found.items()}
 
 
 def _chosen(extras: tuple[str, ...], error: BaseException) -> str:

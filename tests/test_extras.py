@@ -34,6 +34,18 @@ def test_extra_is_that_of_the_importing_package(module: str, importer: str, extr
     assert missing_extra(failed(module, importer)) == f"it comes with: pip install 'robot-dataflow[{extra}]'"
 
 
+@pytest.mark.parametrize(("machine", "more"), [("x86_64", ""), ("aarch64", "where platform_machine != ")])
+def test_condition_on_the_processor_is_given_where_it_concerns_this_one(
+    machine: str, more: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    told = missing_extra(failed("vqf", "operators.fusion.orientation"))
+    assert told.startswith("it comes with: pip install 'robot-dataflow[perception]'")
+    assert told.endswith('python_version < "3.12"') is bool(more)
+    assert more in told
+    assert "where" not in missing_extra(failed("cv2", "operators.codec"))
+
+
 def test_cause_of_an_error_is_searched() -> None:
     outer = ValueError("cannot load")
     outer.__cause__ = failed("rerun", "dataflow.view.sink")
