@@ -89,7 +89,7 @@ class Declaration:
                     for name, a in inspect.get_annotations(above).items()
                 }
             except NameError as error:
-                where = f"{error}; port types must be importable where the class is made"
+                where = f"{error}; types of ports and of the state must be known where the class is made: above it"
                 raise self.fault("(annotations)", where) from None
         return hints
 

@@ -71,7 +71,7 @@ class X(Operator): image: In[Image]; gain = Param(1, doc='g'); PROCESS
 class X(Operator): image: In[int]; PROCESS
   X.image: needs a message type: In[Image]
 class X(Operator): image: In[Nothing]; PROCESS
-  X.(annotations): name 'Nothing' is not defined
+  X.(annotations): name 'Nothing' is not defined; types of ports and of the state must be known
 class X(Operator): image: In[Image] = Out(); PROCESS
   X.image: is annotated In[...] but set to a Out
 class X(Operator): context: In[Image]; PROCESS
