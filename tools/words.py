@@ -1,4 +1,4 @@
-"""Lists wording that the style of this project avoids, in docstrings, messages, comments and pages.
+"""Lists wording that the style of this project avoids, in docstrings, messages, comments, pages and YAML files.
 
 Run `python tools/words.py [PATH ...]`; without paths it reads product and pages. It ends with 1 if it finds any.
 """
@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-DEFAULT = ("dataflow", "operators", "docs", "benchmarks", "README.md")
+DEFAULT = ("dataflow", "operators", "graphs", "docs", "benchmarks", "README.md")
 GENERATED = ("docs/api.md", "docs/messages.md", "docs/operators.md")
 """Pages that hold the docstrings again."""
 
@@ -31,7 +31,7 @@ HINT = re.compile(r"(?i:some|no|any)body\b|(?i:whoever)|\b(?i:own)\b|\b(?i:tells
 
 
 def texts_of(file: Path) -> Iterator[tuple[int, str]]:
-    """Yields the line number and the text of each piece of prose in a Python or Markdown file."""
+    """Yields the line number and the text of each piece of prose in a Python, Markdown or YAML file."""
     source = file.read_text(encoding="utf-8")
     if not HINT.search(source):
         return
@@ -54,7 +54,7 @@ def python_prose(source: str) -> Iterator[tuple[int, str]]:
 
 
 def page_prose(source: str) -> Iterator[tuple[int, str]]:
-    """Yields the lines of a page outside of its code blocks, without inline code and link targets."""
+    """Yields the lines of a page or YAML file outside of code blocks, without inline code and link targets."""
     inside = False
     for number, line in enumerate(source.splitlines(), 1):
         if line.lstrip().startswith("```"):
@@ -72,10 +72,10 @@ def findings(file: Path) -> Iterator[tuple[int, str, str]]:
 
 
 def files_under(paths: list[Path]) -> list[Path]:
-    """Returns the Python and Markdown files at or below the paths, sorted, without generated pages."""
+    """Returns the Python, Markdown and YAML files at or below the paths, sorted, without generated pages."""
     found = {path for root in paths for path in ([root] if root.is_file() else root.rglob("*"))}
     generated = {ROOT / page for page in GENERATED}
-    return sorted(path for path in found if path.suffix in (".py", ".md") and path.resolve() not in generated)
+    return sorted(path for path in found if path.suffix in (".py", ".md", ".yaml") and path.resolve() not in generated)
 
 
 def main() -> int:

@@ -24,6 +24,7 @@ def test_nothing_is_found() -> None:
     [
         ("a.md", "Nobody waits.\n```\nnobody\n```\nIt `says` so.\n", 1),
         ("a.md", "A queue of its own. What is late is dropped.\n", 2),
+        ("a.yaml", "# Nobody waits.\nnote: it knows\nsays: `says`  # tell\n", 3),
         ("a.py", '"""Tells it."""\nx = "it knows nobody"  # somebody\nsays = 1\n', 4),
     ],
 )
