@@ -1,4 +1,4 @@
-"""Asks the flight recorder of a running graph to keep what was."""
+"""Asks the flight recorder of a running graph to save its history."""
 
 from __future__ import annotations
 

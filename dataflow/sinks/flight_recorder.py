@@ -290,7 +290,7 @@ class FlightSink:
         return bool(waited >= (RECORDS_WITHIN if behind else self._options["settle"]))
 
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
-        """Asks to keep what was before now and will be after; what is asked for meanwhile becomes one.
+        """Asks to save the history before now and the messages after it; what is asked for meanwhile becomes one.
 
         Now is the newest stamp that came, not `stamp`: a run that is paused, or slower than the clock, is behind it.
         """

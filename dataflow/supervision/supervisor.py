@@ -81,7 +81,7 @@ class Supervisor:
         self._wake_up()
 
     def trigger(self, text: str) -> None:
-        """Has the flight recorder keep what was; on any thread."""
+        """Has the flight recorder save its history; on any thread."""
         self._asked.append(events.TriggerAsked(text))
         self._wake_up()
 

@@ -61,7 +61,7 @@ class PlaybackAsked(Event):
 
 @dataclass(frozen=True, slots=True)
 class TriggerAsked(Event):
-    """The user asks the flight recorder to keep what was."""
+    """The user asks the flight recorder to save its history."""
 
     text: str
 

@@ -196,7 +196,7 @@ class RunState:
                 self.send(process, kind, **fields)
 
     def trigger(self, text: str) -> None:
-        """Has the flight recorder keep what was."""
+        """Has the flight recorder save its history."""
         self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
 
     def event(self, name: str, text: str, /, **data: Any) -> None:
