@@ -11,7 +11,6 @@ from mcap.writer import Writer
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.interop.unpacking import Unpacked
 from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.recording.mcap.attachments import Attachment, names_once, tells_of_run
 from dataflow.recording.mcap.index import McapFile
@@ -29,7 +28,7 @@ class Extras:
     """
 
     def __init__(self, material: Material) -> None:
-        files = material.bag.files if isinstance(material.bag, McapBag | Unpacked) else ()
+        files = material.bag.files if isinstance(material.bag, McapBag) else ()
         self._files = list(files)
         listed = [[(n, v) for n, v in f.metadata if material.foreign or not tells_of_run(n)] for f in files]
         names_of_all = {name for f in files for name, _ in f.metadata}
