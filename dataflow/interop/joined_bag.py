@@ -14,12 +14,14 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import zstandard
 
 from dataflow.interop.bag import BagError, Lost, Stored, Topic
-from dataflow.interop.salvage import Row, Wreck
+from dataflow.interop.salvage import Wreck
 from dataflow.interop.unpacking import unpacked_message
 from dataflow.recording.errors import RecordingError
 
 Place = tuple[int, int]
 """Number of a file, and of a channel in it."""
+Row = tuple[int, int, bytes | memoryview]
+"""(log time, number of the channel, message)"""
 
 
 class Opened(Protocol):

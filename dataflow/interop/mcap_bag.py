@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from dataflow.interop.bag import Topic, is_latched
-from dataflow.interop.joined_bag import JoinedBag
-from dataflow.interop.salvage import Row
+from dataflow.interop.joined_bag import JoinedBag, Row
 from dataflow.recording.errors import DamagedError
 from dataflow.recording.layout import Kind
 from dataflow.recording.mcap.cache import ChunkCache

@@ -31,7 +31,7 @@ MAX_PAYLOAD = 1 << 30
 KEPT_CHUNKS = 8
 NO_SCHEMA = SchemaText("", "", b"")
 
-Row = tuple[int, int, bytes | memoryview]
+Row = tuple[int, int, bytes]
 """(log time, number of the topic, message)"""
 
 
