@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from mcap.writer import CompressionType, Writer
+from ruamel.yaml import YAML
+from ruamel.yaml.scalarstring import LiteralScalarString
 
 from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
@@ -104,9 +105,11 @@ class Ros2Writer:
         """Finishes the file and writes metadata.yaml."""
         self.mcap.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
-        (self.folder / "metadata.yaml").write_text(self._metadata(), encoding="utf-8")
+        yaml = YAML()
+        yaml.width = 10_000
+        yaml.dump({"rosbag2_bagfile_information": self._metadata()}, self.folder / "metadata.yaml")
 
-    def _metadata(self) -> str:
+    def _metadata(self) -> dict[str, Any]:
         first, total = self._first or 0, sum(channel.count for channel in self._channels.values())
         span = self._last - first if total else 0
 
@@ -116,13 +119,12 @@ class Ros2Writer:
         topics = []
         for (topic, _), channel in self._channels.items():
             about = {"name": topic, "type": channel.type, "serialization_format": "cdr"}
-            about["offered_qos_profiles"] = channel.qos
+            about["offered_qos_profiles"] = LiteralScalarString(channel.qos)
             topics.append({"topic_metadata": about, "message_count": channel.count})
         bag = {"version": 5, "storage_identifier": "mcap", **times(), "message_count": total}
         bag |= {"topics_with_message_count": topics, "compression_format": "", "compression_mode": ""}
         bag |= {"relative_file_paths": [self.file.name]}
-        bag |= {"files": [{"path": self.file.name, **times(), "message_count": total}]}
-        return str(yaml.safe_dump({"rosbag2_bagfile_information": bag}, sort_keys=False, allow_unicode=True))
+        return {**bag, "files": [{"path": self.file.name, **times(), "message_count": total}]}
 
 
 def export_ros2(source: ExportSource, folder: Path, done: Exported) -> None:
