@@ -35,7 +35,7 @@ def kept(memory: int, operator: str) -> list[int]:
     return [decode_batch(data).records[0].index for data in read_black_box(memory, PORTS).batches[operator]]
 
 
-def test_a_box_that_nobody_wrote_to_holds_nothing(memory: int) -> None:
+def test_a_new_black_box_is_empty(memory: int) -> None:
     assert read_black_box(memory, PORTS).reached == {"camera": Reached(), "detector": Reached()}
 
 

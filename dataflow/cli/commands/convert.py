@@ -49,8 +49,8 @@ from dataflow.cli.support.output import (
 
 if TYPE_CHECKING:
     from dataflow.interop.account import Account
-    from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.source import ExportSource
     from dataflow.interop.playing import Wishes
 
 Format = Literal[
@@ -229,11 +229,11 @@ def _draw(
 
 def _left_by_rrd(recording: Path) -> Exported:
     from dataflow.interop.export.extras import tell_left_out
-    from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.source import ExportSource
 
     done = Exported()
-    with Material(recording) as material:
+    with ExportSource(recording) as material:
         tell_left_out(material, "rrd", done)
         return done
 
@@ -299,13 +299,13 @@ def _opened(
     end: float | None,
     clock: Literal["auto", "header", "log"],
     wishes: Wishes,
-) -> Iterator[Material]:
-    from dataflow.interop.export.material import Material
+) -> Iterator[ExportSource]:
+    from dataflow.interop.export.source import ExportSource
     from dataflow.recording.layout import RECORDING
     from dataflow.recording.streams.cutting import cut_of
 
     metadata: Mapping[str, Mapping[str, str]]
-    with Material(path, clock=clock, wishes=wishes) as whole:
+    with ExportSource(path, clock=clock, wishes=wishes) as whole:
         found = [*whole.account.notes, *whole.account.short]
         if not any(topic.count for topic in whole.bag.topics.values()) and found:
             raise fail(f"{path} holds no message that can be read: {'; '.join(found)}")
@@ -323,11 +323,11 @@ def _opened(
         begin, finish = window(_span(whole, None if part is None else part.start), start, end, path)
         if whole.clock:
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
-    with Material(path, chosen, clock, begin, finish, wishes) as material:
+    with ExportSource(path, chosen, clock, begin, finish, wishes) as material:
         yield material
 
 
-def _span(whole: Material, begin: int | None) -> tuple[int, int] | None:
+def _span(whole: ExportSource, begin: int | None) -> tuple[int, int] | None:
     """The first and the last stamp (ns) of all but static streams; `begin`: where a part begins."""
     spans = [(i.first, i.last, 0) for i in whole.streams.values() if not i.static]
     spans += [(t.first, t.last, whole.shift) for t in whole.untouched]
@@ -337,7 +337,7 @@ def _span(whole: Material, begin: int | None) -> tuple[int, int] | None:
 
 
 def _export(
-    material: Material,
+    material: ExportSource,
     output: Path,
     to: str,
     watch: Callable[[int], None] | None,

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
-    from dataflow.recording.mcap.index import McapFile
     from dataflow.supervision.core.report import RunReport, Watch
 
 
@@ -144,6 +143,7 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
     """Prints the topics of a bag: types, counts, rates, and what each can be played as; of MCAP files what they hold
     besides, with `metadata` all of it."""
     from dataflow.interop.bag import shortfalls
+    from dataflow.interop.mcap_bag import McapBag
     from dataflow.interop.opening import open_bag
     from dataflow.interop.playing import readings_of
     from dataflow.interop.summary import summaries, total
@@ -153,7 +153,7 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
     try:
         rows = summaries(bag, readings_of(bag))
         kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
-        files: Sequence[McapFile] = getattr(bag, "files", ())
+        files = bag.files if isinstance(bag, McapBag) else []
         records = [(name, values) for file in files for name, values in file.metadata]
         attached = sum(file.attached for file in files)
     finally:

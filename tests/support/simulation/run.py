@@ -207,7 +207,7 @@ class Simulation:
             (f"{supervision}.rings", "os"): system,
             (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
-            ("dataflow.sinks.live_sink", "let_others_begin"): _nothing,
+            ("dataflow.sinks.sink", "let_others_begin"): _nothing,
             (f"{process}.operator_process", "gc"): SimpleNamespace(freeze=lambda: None),  # processes end here
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),

@@ -1,4 +1,4 @@
-"""Material of an export: the streams of a recording or the topics of a bag, and those that nothing here can read."""
+"""The streams of a recording or the topics of a bag for an export, and those that nothing here can read."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def distinct(names: Iterable[str], called: Callable[[str], str], taken: Iterable
     return found
 
 
-class Material:
+class ExportSource:
     """A recording or a bag opened for conversion: a context manager.
 
     `streams`: what is read as messages, by name; `names`: what each is called outside (without the namespace).
@@ -51,42 +51,42 @@ class Material:
         wishes: Wishes = PLAIN,
     ) -> None:
         self.path, self.foreign = Path(path), is_foreign(Path(path))
-        self._source: Recording | BagStreams | None = None
+        self._reader: Recording | BagStreams | None = None
         self.bag: Bag = open_bag(self.path, strict=wishes.strict)
         self.start, self.end = start, end
         try:
             if self.foreign:
-                self._source = readable(self.bag, self.path, clock, topics, wishes, accounting=True)
+                self._reader = readable(self.bag, self.path, clock, topics, wishes, accounting=True)
                 namespace = ""
-                self.account = self._source.account
+                self.account = self._reader.account
             else:
                 if wishes.depth:
                     raise BagError(f"{self.path} is a recording: its depth is in metres, and no topic of it is made so")
-                self._source = Recording(self.path)
-                namespace = self._source.metadata.get(RECORDING, {}).get("namespace", "")
+                self._reader = Recording(self.path)
+                namespace = self._reader.metadata.get(RECORDING, {}).get("namespace", "")
                 self.account = Account(list(self.bag.notes), shortfalls(self.bag))
             self.streams: dict[str, StreamInfo] = {
                 name: info
-                for name, info in self._source.streams.items()
+                for name, info in self._reader.streams.items()
                 if info.message_type is not None and info.count and (topics is None or name in topics)
             }
             self.names = {name: name.removeprefix(f"{namespace}/") if namespace else name for name in self.streams}
-            self.topics = self._topics_of(self._source)
+            self.topics = self._topics_of(self._reader)
             self.untouched: tuple[Topic, ...] = tuple(
                 topic
                 for name, topic in self.bag.topics.items()
-                if name not in self._source.streams or self._source.streams[name].message_type is None
+                if name not in self._reader.streams or self._reader.streams[name].message_type is None
                 if topics is None or name in topics
             )
         except BaseException:
             self.close()
             raise
 
-    def _topics_of(self, source: Recording | BagStreams) -> dict[str, str]:
+    def _topics_of(self, reader: Recording | BagStreams) -> dict[str, str]:
         """The topic of the bag that each stream comes from, of a bag and of a recording that was made of one."""
         known = {name: info.metadata["topic"] for name, info in self.streams.items() if "topic" in info.metadata}
         try:
-            played = json.loads(source.metadata.get(BAG, {}).get("topics", "{}"))
+            played = json.loads(reader.metadata.get(BAG, {}).get("topics", "{}"))
         except ValueError:
             return known
         return {name: topic for name, topic in played.items() if name in self.streams} | known
@@ -94,32 +94,32 @@ class Material:
     @property
     def shift(self) -> int:
         """Nanoseconds that are added to the log times of a bag so that they are of the clock of its streams."""
-        return self._source.clock.shift if isinstance(self._source, BagStreams) else 0
+        return self._reader.clock.shift if isinstance(self._reader, BagStreams) else 0
 
     def facts(self) -> dict[str, str]:
         """Metadata of a recording that was made of a bag; complete when all messages have been read."""
-        assert isinstance(self._source, BagStreams)
+        assert isinstance(self._reader, BagStreams)
         self._count_lost()
-        told = {name: text for name, text in self._source.facts().items() if name != "topics"}
+        told = {name: text for name, text in self._reader.facts().items() if name != "topics"}
         account = self.account.as_json()
         kept = {name: json.dumps(account[name], ensure_ascii=False) for name in ("unread", "lost") if account[name]}
         return told | kept
 
     def _count_lost(self) -> None:
         """Takes into the account what damage has kept from being read."""
-        if isinstance(self._source, BagStreams):
-            self.bag.lost.join(self._source.lost)
+        if isinstance(self._reader, BagStreams):
+            self.bag.lost.join(self._reader.lost)
             self.account.short[:] = shortfalls(self.bag)
 
     @property
     def clock(self) -> str:
         """The clock of a bag, and why; empty for a recording."""
-        return f"{self._source.clock.kind}: {self._source.clock.why}" if isinstance(self._source, BagStreams) else ""
+        return f"{self._reader.clock.kind}: {self._reader.clock.why}" if isinstance(self._reader, BagStreams) else ""
 
     def messages(self, names: Sequence[str] | None = None) -> Iterator[Recorded]:
         """The messages of some streams, or of all, merged by (stamp, stream); static ones first."""
-        assert self._source is not None
-        return self._source.messages(list(self.streams if names is None else names), self.start, self.end)
+        assert self._reader is not None
+        return self._reader.messages(list(self.streams if names is None else names), self.start, self.end)
 
     def of_type(self, *types: type[Message]) -> list[str]:
         """Streams of some message types, the order of `types` first."""
@@ -154,9 +154,9 @@ class Material:
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
-        if self._source is not None:
+        if self._reader is not None:
             self._count_lost()
-            self._source.close()
+            self._reader.close()
         self.bag.close()
 
     def __enter__(self) -> Self:
