@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, MutableMapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from dataclasses import dataclass, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,41 +49,66 @@ class Command:
     def add_to(self, app: typer.Typer) -> None:
         """Registers the function with an application."""
         module, _, function = self.home.partition(":")
-        called: Callable[..., None] = getattr(import_module(f"dataflow.cli.commands.{module}"), function)
-        if self.elsewhere:
-            called = _elsewhere(called)
+        called = _with_options(getattr(import_module(f"dataflow.cli.commands.{module}"), function), self.elsewhere)
         settings = {"ignore_unknown_options": True} if self.ignore_unknown_options else {}
         app.command(
             self.called, rich_help_panel=self.panel, help=paragraphs(called.__doc__ or ""), context_settings=settings
         )(called)
 
 
-def _elsewhere(called: Callable[..., None]) -> Callable[..., None]:
-    """Returns a command with the options that name a graph of another machine."""
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The options that name a graph of another machine."""
 
-    @functools.wraps(called)
-    def at(*words: Any, connect: str | None = None, keys: Path | None = None, **options: Any) -> None:
-        if connect is None:
-            called(*words, **options)
+    connect: Annotated[
+        str | None,
+        typer.Option("--connect", metavar="ENDPOINT", help="Follow a graph of another machine: its --listen."),
+    ] = None
+    keys: Annotated[
+        Path | None,
+        typer.Option("--keys", metavar="FOLDER", help="Keys of tools or of a machine, for --connect."),
+    ] = None
+
+
+def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[..., None]:
+    """Returns a command as Typer takes it: what groups options (a dataclass) is replaced by its fields."""
+    taken = [*_single(called), *(_single(Elsewhere) if elsewhere else ())]
+
+    def command(**given: Any) -> None:
+        where = _filled(Elsewhere, given) if elsewhere else Elsewhere()
+        if where.connect is None:
+            _filled(called, given)
             return
-        from dataflow.client.attach import elsewhere
+        from dataflow.client.attach import elsewhere as attached
 
-        with elsewhere(connect, keys):
-            called(*words, **options)
+        with attached(where.connect, where.keys):
+            _filled(called, given)
 
-    where = typer.Option("--connect", metavar="ENDPOINT", help="Follow a graph of another machine: its --listen.")
-    held = typer.Option("--keys", metavar="FOLDER", help="Keys of tools or of a machine, for --connect.")
-    added = {"connect": Annotated[str | None, where], "keys": Annotated[Path | None, held]}
-    signature = inspect.signature(called, eval_str=True)
-    known = list(signature.parameters.values())
-    more = [inspect.Parameter(name, _KEYWORD, default=None, annotation=kind) for name, kind in added.items()]
-    at.__signature__ = signature.replace(parameters=[*known, *more])  # type: ignore[attr-defined]
-    at.__annotations__ = {each.name: each.annotation for each in (*known, *more)}
-    del at.__wrapped__
-    return at
+    functools.update_wrapper(command, called)
+    del command.__wrapped__  # type: ignore[attr-defined]
+    command.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in taken}
+    return command
 
 
-_KEYWORD = inspect.Parameter.KEYWORD_ONLY
+def _single(made: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """The parameters of a function or a group, with those of the groups among them in their places."""
+    for each in inspect.signature(made, eval_str=True).parameters.values():
+        if _is_group(each.annotation):
+            yield from _single(each.annotation)
+        else:
+            yield each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+def _filled(made: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """Calls a function, or makes a group, from the values of single options."""
+    parameters = inspect.signature(made, eval_str=True).parameters
+    kinds = {name: each.annotation for name, each in parameters.items()}
+    return made(**{name: _filled(kind, given) if _is_group(kind) else given[name] for name, kind in kinds.items()})
+
+
+def _is_group(annotation: Any) -> bool:
+    return is_dataclass(annotation)
 
 
 @dataclass(frozen=True, slots=True)

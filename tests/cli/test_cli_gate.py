@@ -178,16 +178,7 @@ def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
 ) -> None:
     torn, baseline = tmp_path / "torn.mcap", tmp_path / "accepted.json"
     without_message(folder / "recordings" / "first.mcap", "test/left/fast", 9, torn)
-    words = [
-        "verify",
-        torn,
-        "--graph",
-        graph_of(tmp_path, "g.yaml", one),
-        "--baseline",
-        baseline,
-        "--one-process",
-        "-q",
-    ]
+    words = ("verify", torn, "--graph", graph_of(tmp_path, "g.yaml", one), "--baseline", baseline, "-q")
 
     told = dataflow(*words, "--accept", code=1)
 

@@ -11,12 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import begin_again
+from dataflow.cli.support.again import RECORDED, CodeOptions
 from dataflow.cli.support.arguments import (
     Json,
-    ModuleFolders,
-    OtherGraph,
-    OtherSettings,
     RecordingFile,
     existing_recording,
     number,
@@ -59,9 +56,7 @@ def blame(
             help="What a floating-point value must change by to count, as a part of it.",
         ),
     ] = 1e-4,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
     """Find what decided a value: the chain of calls back to the sensors' messages.
@@ -85,7 +80,7 @@ def blame(
     with friendly_errors():
         recording = existing_recording(recording)
         asked = _field(field)
-        loaded = begin_again(recording, graph, settings, path, stream=asked.stream)
+        loaded = code.begin_again(recording, stream=asked.stream)
         chain, begin = _found(recording, asked, loaded, budget, tolerance)
     if json:
         print_json(chain.as_json())
@@ -102,9 +97,7 @@ def drops(
         typer.Option("--worse", metavar="EXPRESSION", help='True of figures that are bad: "ate_rmse_m > 0.05".'),
     ],
     budget: Budget = 60.0,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
     """Find which drops, late messages and timeouts of a live run cost its result.
@@ -122,7 +115,7 @@ def drops(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path)
+        loaded = code.begin_again(recording)
         from dataflow.drops.search import Drops
         from dataflow.recording import Recording
 

@@ -13,13 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import begin_again
+from dataflow.cli.support.again import RECORDED, CodeOptions
 from dataflow.cli.support.arguments import (
     FLAG,
     Json,
-    ModuleFolders,
-    OtherGraph,
-    OtherSettings,
     RecordingFile,
     existing_recording,
     number,
@@ -67,9 +64,7 @@ def debug(
         list[str] | None,
         typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
     ] = None,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     make_effects: MakeEffects = False,
     view: ViewTarget = None,
     dap: DapPort = None,
@@ -101,7 +96,7 @@ def debug(
         recording = existing_recording(recording)
         if dap is not None and (do or json or view):
             raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
-        loaded = begin_again(recording, graph, settings, path, operator.partition("@")[0])
+        loaded = code.begin_again(recording, operator.partition("@")[0])
         _debug(recording, operator, loaded, do, make_effects=make_effects, view=view, dap=dap, json=json)
 
 
@@ -129,9 +124,7 @@ def capture(
         typer.Option("--to", metavar="TEST.py", help="The file to write. Default: test_OPERATOR_N.py here."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
     """Capture a wrong call as a test: the smallest inputs that still show it, without the recording.
@@ -153,11 +146,8 @@ def capture(
     """
     with friendly_errors():
         recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path, operator)
-        words = [] if graph is None else ["--graph", str(graph)]
-        words += [word for setting in settings or () for word in ("--set", setting)]
-        words += [word for folder in path or () for word in ("--path", str(folder))]
-        _capture(recording, operator, loaded, firing, predicate, to, words, overwrite=overwrite, json=json)
+        loaded = code.begin_again(recording, operator)
+        _capture(recording, operator, loaded, firing, predicate, to, code.words, overwrite=overwrite, json=json)
 
 
 def _capture(

@@ -12,9 +12,10 @@ from rich.padding import Padding
 from rich.text import Text
 
 from dataflow.cli.support.arguments import Json, number, output_file, span
-from dataflow.cli.support.execution import Outputs, execute, plan_options
+from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
 from dataflow.cli.support.output import fail, friendly_errors, out, print_json, say, seconds
-from dataflow.cli.support.run_options import Quiet
+from dataflow.cli.support.run_options import Quiet, ReportOptions, ViewOptions
+from dataflow.cli.support.storage import RecordOptions
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -59,7 +60,6 @@ def demo(
     """
     began = time.monotonic()
     import dataflow.shipped as shipped
-    from dataflow.cli.support.execution import checked_outputs
     from dataflow.graph import load_graph
     from dataflow.supervision.run import replay as replay_recording
 
@@ -68,19 +68,18 @@ def demo(
         if graph is None or recording is None:
             where = shipped.folder("graphs").parent
             raise fail(f"the demo's graph or recording is missing under {where}; install robot-dataflow again")
-        outputs = _outputs() if to is None else checked_outputs(None, to, False, False)
+        outputs = _outputs() if to is None else checked_outputs(RecordOptions(), ViewOptions(to), overwrite=False)
         loaded = load_graph(graph.path)
         rate = None if outputs.view_file is not None else 1.0
-        options = plan_options(loaded, outputs, False, False, None, rate, False, 120.0)
+        options = plan_options(loaded, outputs, rate=rate)
         shown = _announced(recording, loaded, duration, in_real_time=rate is not None)
         execute(
             lambda watch: replay_recording(recording, graph=loaded, end=duration, watch=watch, **options),
             loaded,
             outputs,
             shown,
+            ReportOptions(quiet=quiet, json=json),
             began=began,
-            json=json,
-            quiet=quiet,
         )
     if not json:
         _print_next(recording, outputs)

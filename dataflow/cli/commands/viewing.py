@@ -6,6 +6,7 @@ import importlib
 import time
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,13 +15,10 @@ from rich.markup import escape
 
 from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
 from dataflow.cli.support.arguments import (
-    Clock,
-    End,
+    ALL,
     Every,
     Overwrite,
-    Start,
-    Streams,
-    Without,
+    Selection,
     chosen_streams,
     existing_recording,
     output_file,
@@ -57,11 +55,7 @@ def view(
             "runs (rerun+http://127.0.0.1:9876/proxy).",
         ),
     ] = "spawn",
-    streams: Streams = None,
-    without: Without = None,
-    start: Start = None,
-    end: End = None,
-    clock: Clock = "auto",
+    asked: Selection = ALL,
     graph: GraphName = None,
     wait: Wait = 0.0,
     every: Every = None,
@@ -91,12 +85,11 @@ def view(
             if graph is not None or wait:
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
             path = existing_recording(recording)
-            target = _target(to, overwrite)
-            report(draw_recording(path, target, streams, without, start, end, clock, every))
+            report(draw_recording(path, _target(to, overwrite), asked, every))
         else:
-            if start is not None or end is not None or without or clock != "auto":
+            if replace(asked, streams=None, without=asked.without or None) != ALL:
                 raise fail("--start, --end, --without and --clock are about a recording; name one")
-            _view_running(_target(to, overwrite), streams, graph, wait, every, until_end=until_end)
+            _view_running(_target(to, overwrite), asked.streams, graph, wait, every, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:

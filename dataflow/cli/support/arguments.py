@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -54,14 +55,6 @@ OtherGraph = Annotated[
 AnyRecording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")
 ]
-Map = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--map",
-        metavar="TOPIC=STREAM",
-        help="Of a bag: the topic that stands in for a stream of the graph's sources. May be repeated.",
-    ),
-]
 Clock = Annotated[
     Literal["auto", "header", "log"],
     typer.Option(
@@ -74,6 +67,14 @@ Strict = Annotated[
     bool,
     typer.Option(
         "--strict", metavar=FLAG, help="Of a bag: fail at a message that cannot be read, instead of counting it."
+    ),
+]
+Map = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map",
+        metavar="TOPIC=STREAM",
+        help="Of a bag: the topic that stands in for a stream of the graph's sources. May be repeated.",
     ),
 ]
 OutInstead = Annotated[
@@ -130,6 +131,35 @@ Streams = Annotated[
 Without = Annotated[
     list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class BagOptions:
+    """How the topics of a bag are played."""
+
+    maps: Map = None
+    clock: Clock = "auto"
+    strict: Strict = False
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which messages are taken: streams, a span, and the clock of a bag."""
+
+    streams: Streams = None
+    without: Without = None
+    start: Start = None
+    end: End = None
+    clock: Clock = "auto"
+
+    def of(self, names: Iterable[str], namespace: str) -> list[str]:
+        """The streams that are asked for."""
+        return chosen_streams(self.streams, names, namespace, self.without)
+
+
+ALL = Selection()
+
+
 ModuleFolders = Annotated[
     list[Path] | None,
     typer.Option(

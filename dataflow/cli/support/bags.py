@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
@@ -32,6 +32,8 @@ from dataflow.cli.support.output import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from dataflow.cli.support.arguments import BagOptions
+    from dataflow.cli.support.run_options import ReportOptions
     from dataflow.graph import Graph
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
@@ -42,18 +44,14 @@ if TYPE_CHECKING:
 def replay_bag(
     path: Path,
     graph: Graph,
-    maps: Sequence[str],
-    clock: Literal["auto", "header", "log"],
+    bag: BagOptions,
     start: float | None,
     end: float | None,
     outputs: Outputs,
     options: dict[str, Any],
+    told: ReportOptions,
     *,
-    strict: bool = False,
     began: float,
-    json: bool,
-    quiet: bool,
-    verbose: bool,
 ) -> None:
     """Replays a bag through a graph; prints which topics are played, by which clock, and what was repaired."""
     from dataflow.editing.untouched import keep_untouched
@@ -64,9 +62,12 @@ def replay_bag(
     from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay
 
-    matching = match(path, graph, maps)
-    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch, strict=strict) as opened:
-        if not quiet:
+    matching = match(path, graph, bag.maps or ())
+    with (
+        _counting(told.quiet) as watch,
+        BagStreams(path, matching.played(), bag.clock, watch=watch, strict=bag.strict) as opened,
+    ):
+        if not told.quiet:
             say_what_is_played(matching, opened)
         whole = span(opened, plan_replay(opened, graph).streams)
         begin, finish = window(whole, start, end, path)
@@ -79,20 +80,11 @@ def replay_bag(
             notice(path, opened.account.short)
             return report
 
-        execute(
-            playing,
-            graph,
-            outputs,
-            shown,
-            began=began,
-            json=json,
-            quiet=quiet,
-            verbose=verbose,
-        )
+        execute(playing, graph, outputs, shown, told, began=began)
         if outputs.record is not None:
             played = {p.topic for p in opened.played.values()}
             kept = keep_untouched(outputs.record, path, played, begin, finish, shift=opened.clock.shift)
-            if kept and not quiet:
+            if kept and not told.quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
         if opened.account.short:

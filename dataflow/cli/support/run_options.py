@@ -2,78 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dataflow.cli.support.arguments import FLAG, number
 from dataflow.cli.support.output import fail
+from dataflow.cli.support.storage import OUTPUT
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
 
-PLACEMENT, OUTPUT = "Placement", "Results"
+PLACEMENT = "Placement"
+TIMEOUT = 120.0
+"""Seconds without any progress after which a run is given up."""
 
-OneProcess = Annotated[
-    bool,
-    typer.Option("--one-process", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run all operators in one process."),
-]
-ProcessEach = Annotated[
-    bool,
-    typer.Option(
-        "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a separate process."
-    ),
-]
-Place = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--place",
-        metavar="OPERATOR=PROCESS",
-        rich_help_panel=PLACEMENT,
-        help="Run OPERATOR in the process of that name. May be repeated.",
-    ),
-]
-Record = Annotated[
-    Path | None,
-    typer.Option(
-        "--record", metavar="FILE.mcap", rich_help_panel=OUTPUT, help="Record the graph's streams and firings."
-    ),
-]
-Compression = Annotated[
-    Literal["zstd", "lz4", "none"] | None,
-    typer.Option(
-        "--compression",
-        metavar="zstd|lz4|none",
-        rich_help_panel=OUTPUT,
-        help="How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
-    ),
-]
-View = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="TARGET",
-        rich_help_panel=OUTPUT,
-        help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
-    ),
-]
-Open = Annotated[
-    bool,
-    typer.Option(
-        "--open",
-        metavar=FLAG,
-        rich_help_panel=OUTPUT,
-        help="With --view FILE.rrd: open the saved file in the viewer when there is a display.",
-    ),
-]
 Replace = Annotated[
     bool,
     typer.Option("--overwrite", metavar=FLAG, rich_help_panel=OUTPUT, help="Replace output files that exist."),
-]
-Json = Annotated[
-    bool,
-    typer.Option("--json", metavar=FLAG, rich_help_panel=OUTPUT, help="Print the report, digests included, as JSON."),
 ]
 Rate = Annotated[
     float | None,
@@ -100,12 +48,6 @@ Keys = Annotated[
     Path | None,
     typer.Option("--keys", metavar="FOLDER", rich_help_panel=PLACEMENT, help="This machine's keys (`dataflow keys`)."),
 ]
-Here = Annotated[
-    bool,
-    typer.Option(
-        "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, without regard to `machine:`."
-    ),
-]
 Timeout = Annotated[
     float,
     typer.Option(
@@ -113,15 +55,6 @@ Timeout = Annotated[
         metavar="SECONDS",
         parser=number(0.1, 1e6, "seconds"),
         help="Give up after so long without any progress, and when the operators take longer to be set up.",
-    ),
-]
-Live = Annotated[
-    bool,
-    typer.Option(
-        "--live",
-        metavar=FLAG,
-        help="Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
-        "`live:` policies say. Everything dropped is counted and recorded.",
     ),
 ]
 Paranoid = Annotated[
@@ -136,20 +69,91 @@ MakeEffects = Annotated[
         "call that is not recorded gets the new one.",
     ),
 ]
-LogLevel = Annotated[
-    str | None,
-    typer.Option(
-        "--log-level",
-        metavar="LEVEL",
-        help="The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
-        "Environment: DATAFLOW_LOG_LEVEL.",
-    ),
-]
 Verbose = Annotated[
     bool,
     typer.Option("--verbose", "-v", metavar=FLAG, help="Report every operator, every figure, every loss."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementOptions:
+    """Which processes run the operators."""
+
+    one_process: Annotated[
+        bool,
+        typer.Option(
+            "--one-process", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run all operators in one process."
+        ),
+    ] = False
+    process_each: Annotated[
+        bool,
+        typer.Option(
+            "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a separate process."
+        ),
+    ] = False
+    place: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--place",
+            metavar="OPERATOR=PROCESS",
+            rich_help_panel=PLACEMENT,
+            help="Run OPERATOR in the process of that name. May be repeated.",
+        ),
+    ] = None
+
+    def placement(self, graph: Graph) -> Any:
+        """The `placement` of a run plan."""
+        if self.one_process + self.process_each + bool(self.place) > 1:
+            raise fail("--one-process, --process-each and --place exclude each other")
+        if not self.place:
+            return "one_process" if self.one_process else "process_each" if self.process_each else "graph"
+        placement = {}
+        for word in self.place:
+            operator, separator, process = word.partition("=")
+            if not separator or not process or operator not in graph.nodes:
+                known = ", ".join(graph.nodes)
+                raise fail(f"--place {word!r}: expected OPERATOR=PROCESS with an operator of the graph ({known})")
+            placement[operator] = process
+        return placement
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """The viewer of a run."""
+
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            metavar="TARGET",
+            rich_help_panel=OUTPUT,
+            help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
+        ),
+    ] = None
+    open_saved: Annotated[
+        bool,
+        typer.Option(
+            "--open",
+            metavar=FLAG,
+            rich_help_panel=OUTPUT,
+            help="With --view FILE.rrd: open the saved file in the viewer when there is a display.",
+        ),
+    ] = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOptions:
+    """What a run prints."""
+
+    quiet: Quiet = False
+    verbose: Verbose = False
+    json: Annotated[
+        bool,
+        typer.Option(
+            "--json", metavar=FLAG, rich_help_panel=OUTPUT, help="Print the report, digests included, as JSON."
+        ),
+    ] = False
 
 
 def machines_of(
