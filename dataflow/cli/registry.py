@@ -6,6 +6,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -13,6 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import friendly_errors
 from dataflow.cli.support.values import take_plainly
 
 MAKE = "Run, replay, verify"
@@ -60,14 +63,10 @@ class Command:
 class Elsewhere:
     """The options that name a graph of another machine."""
 
-    connect: Annotated[
-        str | None,
-        typer.Option("--connect", metavar="ENDPOINT", help="Follow a graph of another machine: its --listen."),
-    ] = None
-    keys: Annotated[
-        Path | None,
-        typer.Option("--keys", metavar="FOLDER", help="Keys of tools or of a machine, for --connect."),
-    ] = None
+    connect: Annotated[str | None, option("--connect ENDPOINT", "Follow a graph of another machine: its --listen.")] = (
+        None
+    )
+    keys: Annotated[Path | None, option("--keys FOLDER", "Keys of tools or of a machine, for --connect.")] = None
 
 
 def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[..., None]:
@@ -76,12 +75,7 @@ def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[...,
 
     def command(**given: Any) -> None:
         where = _filled(Elsewhere, given) if elsewhere else Elsewhere()
-        if where.connect is None:
-            _filled(called, given)
-            return
-        from dataflow.client.attach import elsewhere as attached
-
-        with attached(where.connect, where.keys):
+        with friendly_errors(), _attached(where):
             _filled(called, given)
 
     functools.update_wrapper(command, called)
@@ -89,6 +83,14 @@ def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[...,
     command.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in taken}
     return command
+
+
+def _attached(where: Elsewhere) -> AbstractContextManager[None]:
+    if where.connect is None:
+        return nullcontext()
+    from dataflow.client.attach import elsewhere
+
+    return elsewhere(where.connect, where.keys)
 
 
 def _single(made: Callable[..., Any]) -> Iterator[inspect.Parameter]:

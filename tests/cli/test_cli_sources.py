@@ -179,12 +179,7 @@ CHUNKS = (damaged_chunk, wrong_checksum, unknown_compression)
 )
 @pytest.mark.long
 def test_every_command_takes_damage_in_one_way(
-    dataflow,
-    tmp_path: Path,
-    make: Callable[[Path], Path],
-    code: int,
-    file_code: int,
-    said: str,
+    dataflow, tmp_path: Path, make: Callable[[Path], Path], code: int, file_code: int, said: str
 ) -> None:
     """0: nothing is missing; 1: what is there is used, what is missing is said; 2: nothing can be used. `info`
     describes a file, and does not read its chunks; `diff` compares what both hold; `lint` finds any damage."""

@@ -16,7 +16,6 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.support.arguments import (
-    FLAG,
     AnyRecording,
     Json,
     OutInstead,
@@ -30,19 +29,8 @@ from dataflow.cli.support.arguments import (
     window,
 )
 from dataflow.cli.support.material import Quiet
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    count,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    say,
-    shown,
-    table,
-)
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, count, err, fail, out, plural, print_json, say, shown, table
 
 if TYPE_CHECKING:
     from dataflow.interop.account import Account
@@ -77,27 +65,19 @@ class ConvertOptions:
 
     out_option: OutInstead = None
     to: Annotated[
-        Format | None,
-        typer.Option(
-            "--to", metavar="FORMAT", help="The format; the examples name all of them. Not needed for NAME.rrd."
-        ),
+        Format | None, option("--to FORMAT", "The format; the examples name all of them. Not needed for NAME.rrd.")
     ] = None
     chosen: Selection
-    action: Annotated[
-        str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
-    ] = None
-    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = ""
+    action: Annotated[str | None, option("--action STREAM", "Of lerobot: the stream that is the action.")] = None
+    task: Annotated[str, option("--task TEXT", "Of lerobot: what is done.")] = ""
     depth: Annotated[
         list[str] | None,
-        typer.Option(
-            "--depth",
-            metavar="TOPIC[=UNITS]",
-            help="16-bit images of this topic are depth of so many units a metre: 1000 unless given.",
+        option(
+            "--depth TOPIC[=UNITS]",
+            "16-bit images of this topic are depth of so many units a metre: 1000 unless given.",
         ),
     ] = None
-    lossy: Annotated[
-        bool, typer.Option("--lossy", metavar=FLAG, help="Write values with fewer bits where the format has fewer.")
-    ] = False
+    lossy: Annotated[bool, option("--lossy", "Write values with fewer bits where the format has fewer.")] = False
     strict: Strict = False
     overwrite: Overwrite = False
     quiet: Quiet = False
@@ -107,9 +87,7 @@ class ConvertOptions:
 def convert(
     recording: AnyRecording,
     options: ConvertOptions,
-    output: Annotated[
-        Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
-    ] = None,
+    output: Annotated[Path | None, argument("OUTPUT", "The file or folder to write; or name it with --out.")] = None,
 ) -> None:
     """Convert a recording or a bag to another format.
 
@@ -147,15 +125,14 @@ def convert(
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
-    with friendly_errors():
-        existing_recording(recording)
-        output, to = _target(named_once("OUTPUT", output, options.out_option), options.to)
-        _check_output(output, to, options.overwrite)
-        scales = _depth_scales(options.depth or (), to)
-        if to == "rrd":
-            _draw(recording, output, options)
-        else:
-            _convert(recording, output, to, scales, options)
+    existing_recording(recording)
+    output, to = _target(named_once("OUTPUT", output, options.out_option), options.to)
+    _check_output(output, to, options.overwrite)
+    scales = _depth_scales(options.depth or (), to)
+    if to == "rrd":
+        _draw(recording, output, options)
+    else:
+        _convert(recording, output, to, scales, options)
 
 
 def _convert(recording: Path, output: Path, to: Format, scales: dict[str, float], options: ConvertOptions) -> None:

@@ -14,16 +14,9 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.support.again import RECORDED, CodeOptions
-from dataflow.cli.support.arguments import (
-    FLAG,
-    Json,
-    RecordingFile,
-    existing_recording,
-    number,
-    output_file,
-    span,
-)
-from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, size
+from dataflow.cli.support.arguments import Json, RecordingFile, existing_recording, number, output_file, span
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, fail, out, plural, print_json, size
 from dataflow.cli.support.run_options import MakeEffects
 
 EDITOR_COMES = 3600.0
@@ -31,19 +24,16 @@ EDITOR_COMES = 3600.0
 
 ViewTarget = Annotated[
     str | None,
-    typer.Option(
-        "--view",
-        metavar="TARGET",
-        help="Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
+    option(
+        "--view TARGET", "Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd."
     ),
 ]
 DapPort = Annotated[
     float | None,
-    typer.Option(
-        "--dap",
-        metavar="PORT",
+    option(
+        "--dap PORT",
+        "Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
         parser=number(0, 65535, "a port"),
-        help="Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
     ),
 ]
 
@@ -57,12 +47,10 @@ if TYPE_CHECKING:
 def debug(
     recording: RecordingFile,
     operator: Annotated[
-        str,
-        typer.Argument(metavar="OPERATOR[@SECONDS]", help="The operator, and when to begin: at its last call by then."),
+        str, argument("OPERATOR[@SECONDS]", "The operator, and when to begin: at its last call by then.")
     ],
     do: Annotated[
-        list[str] | None,
-        typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
+        list[str] | None, option("--do COMMAND", "Do this and end, without a prompt. May be given several times.")
     ] = None,
     code: CodeOptions = RECORDED,
     make_effects: MakeEffects = False,
@@ -92,38 +80,32 @@ def debug(
       dataflow debug run.mcap tracker --do "until len(out.tracks.ids) > 3"
       dataflow debug run.mcap tracker@12.3 --dap 4711
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        if dap is not None and (do or json or view):
-            raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
-        loaded = code.begin_again(recording, operator.partition("@")[0])
-        _debug(recording, operator, loaded, do, make_effects=make_effects, view=view, dap=dap, json=json)
+    recording = existing_recording(recording)
+    if dap is not None and (do or json or view):
+        raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
+    loaded = code.begin_again(recording, operator.partition("@")[0])
+    _debug(recording, operator, loaded, do, make_effects=make_effects, view=view, dap=dap, json=json)
 
 
 def capture(
     recording: RecordingFile,
-    operator: Annotated[str, typer.Option("--op", metavar="OPERATOR", help="The operator.")],
+    operator: Annotated[str, option("--op OPERATOR", "The operator.")],
     firing: Annotated[
         int | None,
-        typer.Option(
-            "--firing",
-            metavar="N",
-            help="The call, as `debug` counts them: from 0, or from the end if negative. Default: the first wrong one.",
+        option(
+            "--firing N",
+            "The call, as `debug` counts them: from 0, or from the end if negative. Default: the first wrong one.",
         ),
     ] = None,
     predicate: Annotated[
         str,
-        typer.Option(
-            "--predicate",
-            metavar="EXPRESSION",
-            help="True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
+        option(
+            "--predicate EXPRESSION",
+            "True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
         ),
     ] = "",
-    to: Annotated[
-        Path | None,
-        typer.Option("--to", metavar="TEST.py", help="The file to write. Default: test_OPERATOR_N.py here."),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
+    to: Annotated[Path | None, option("--to TEST.py", "The file to write. Default: test_OPERATOR_N.py here.")] = None,
+    overwrite: Annotated[bool, option("--overwrite", "Replace a file that exists.")] = False,
     code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
@@ -144,10 +126,9 @@ def capture(
       dataflow capture run.mcap --op tracker --firing 412 --to test_lost_track.py
       dataflow capture run.mcap --op detector --predicate "out.detections is None"
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        loaded = code.begin_again(recording, operator)
-        _capture(recording, operator, loaded, firing, predicate, to, code.words, overwrite=overwrite, json=json)
+    recording = existing_recording(recording)
+    loaded = code.begin_again(recording, operator)
+    _capture(recording, operator, loaded, firing, predicate, to, code.words, overwrite=overwrite, json=json)
 
 
 def _capture(
@@ -207,7 +188,7 @@ def _debug(
     dap: float | None,
     json: bool,
 ) -> None:
-    from dataflow.cli.support.debug_shell import Shell, WrongCommand
+    from dataflow.cli.support.debug_shell import Shell
     from dataflow.debugging.debugger import Debugger
     from dataflow.recording import Recording
 
@@ -224,8 +205,6 @@ def _debug(
                 return
             begun = [f"goto {first}"] if when or do is None else []
             _converse(shell, [*begun, *(do or ())], interactive=do is None)
-        except WrongCommand as error:
-            raise fail(str(error)) from None
         finally:
             debugger.close()
             if viewer is not None:

@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.text import Text
 
 from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
@@ -23,7 +22,8 @@ from dataflow.cli.support.arguments import (
     span,
     window,
 )
-from dataflow.cli.support.output import err, fail, friendly_errors, out, plural, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import err, fail, out, plural, say
 
 if TYPE_CHECKING:
     from dataflow.client.playback import Steering
@@ -37,17 +37,15 @@ PORT = 8765
 
 def foxglove(
     recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="RECORDING", help="A recording or a bag. Without one: the running graph."),
+        Path | None, argument("RECORDING", "A recording or a bag. Without one: the running graph.")
     ] = None,
-    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Where to listen; 0: a free one.")] = PORT,
+    port: Annotated[int, option("--port PORT", "Where to listen; 0: a free one.")] = PORT,
     host: Annotated[
-        str, typer.Option("--host", metavar="ADDRESS", help="The address to listen on; other machines need another.")
+        str, option("--host ADDRESS", "The address to listen on; other machines need another.")
     ] = "127.0.0.1",
     streams: Streams = None,
     speed: Annotated[
-        float,
-        typer.Option("--speed", metavar="FACTOR", parser=number(0.01, 100, "a factor of real time"), help="At first."),
+        float, option("--speed FACTOR", "At first.", parser=number(0.01, 100, "a factor of real time"))
     ] = 1.0,
     start: Start = None,
     end: End = None,
@@ -71,22 +69,17 @@ def foxglove(
       dataflow foxglove --stream "camera/*" --port 9000
       dataflow foxglove --wait 10
     """
-    from dataflow.foxglove.server import FoxgloveError
 
-    with friendly_errors():
-        if not 0 <= port < 65536:
-            raise fail(f"--port {port}: expected 0 to 65535")
-        try:
-            if recording is not None:
-                if graph is not None or wait:
-                    raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
-                _play(existing_recording(recording), host, port, streams, speed, start, end, clock)
-            else:
-                if start is not None or end is not None or speed != 1.0 or clock != "auto":
-                    raise fail("--start, --end, --speed and --clock are about a recording; name one")
-                _follow(host, port, streams, graph, wait)
-        except FoxgloveError as error:
-            raise fail(str(error)) from error
+    if not 0 <= port < 65536:
+        raise fail(f"--port {port}: expected 0 to 65535")
+    if recording is not None:
+        if graph is not None or wait:
+            raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
+        _play(existing_recording(recording), host, port, streams, speed, start, end, clock)
+    else:
+        if start is not None or end is not None or speed != 1.0 or clock != "auto":
+            raise fail("--start, --end, --speed and --clock are about a recording; name one")
+        _follow(host, port, streams, graph, wait)
 
 
 def _play(

@@ -9,20 +9,9 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, AnyRecording, Json, Streams, existing_recording
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    count,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    seconds,
-    shown,
-    size,
-    table,
-)
+from dataflow.cli.support.arguments import AnyRecording, Json, Streams, existing_recording
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, count, fail, out, plural, print_json, seconds, shown, size, table
 from dataflow.text import visible
 
 if TYPE_CHECKING:
@@ -34,12 +23,8 @@ if TYPE_CHECKING:
 
 def info(
     recording: AnyRecording,
-    digests: Annotated[
-        bool, typer.Option("--digests", metavar=FLAG, help="Read everything and print each stream's digest.")
-    ] = False,
-    metadata: Annotated[
-        bool, typer.Option("--metadata", metavar=FLAG, help="Print all metadata: parameters, versions, machine.")
-    ] = False,
+    digests: Annotated[bool, option("--digests", "Read everything and print each stream's digest.")] = False,
+    metadata: Annotated[bool, option("--metadata", "Print all metadata: parameters, versions, machine.")] = False,
     json: Json = False,
 ) -> None:
     """Describe a recording: streams, types, counts, rates, what made it.
@@ -61,13 +46,12 @@ def info(
     from dataflow.recording.mcap.index import NO_END
     from dataflow.recording.streams.info import describe
 
-    with friendly_errors():
-        if is_foreign(existing_recording(recording)):
-            if digests:
-                raise fail("--digests is of recordings; messages of a bag have none")
-            describe_bag(recording, metadata=metadata, json=json)
-            return
-    with friendly_errors(), Recording(recording) as opened:
+    if is_foreign(existing_recording(recording)):
+        if digests:
+            raise fail("--digests is of recordings; messages of a bag have none")
+        describe_bag(recording, metadata=metadata, json=json)
+        return
+    with Recording(recording) as opened:
         described = describe(opened)
         shown([NO_END, *described.damage])
         computed = dict(opened.digests()) if digests else None
@@ -197,12 +181,11 @@ def _mapping(title: str, values: Mapping[str, Any]) -> Table:
 
 
 def diff(
-    a: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    a: Annotated[Path, argument("A", "A recording.")],
+    b: Annotated[Path, argument("B", "Another one.")],
     streams: Streams = None,
     tolerance: Annotated[
-        float | None,
-        typer.Option("--tolerance", metavar="X", help="Decimal numbers may differ by so much. Default: bit for bit."),
+        float | None, option("--tolerance X", "Decimal numbers may differ by so much. Default: bit for bit.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -222,7 +205,6 @@ def diff(
     from dataflow.recording.streams.diff import diff as compare
 
     with (
-        friendly_errors(),
         Recording(existing_recording(a)) as first,
         Recording(existing_recording(b)) as second,
     ):

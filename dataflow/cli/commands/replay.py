@@ -30,7 +30,8 @@ from dataflow.cli.support.arguments import (
     window,
 )
 from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
-from dataflow.cli.support.output import DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import DIFFERENT, err, fail, out, print_json, say
 from dataflow.cli.support.run_options import (
     TIMEOUT,
     Paranoid,
@@ -62,9 +63,7 @@ class ReplayOptions:
     end: End = None
     rate: Rate = None
     step: Step = False
-    loop: Annotated[
-        int, typer.Option("--loop", metavar="N", help="Replay N times, and compare the passes; 0: until Ctrl-C.")
-    ] = 1
+    loop: Annotated[int, option("--loop N", "Replay N times, and compare the passes; 0: until Ctrl-C.")] = 1
     timeout: Timeout = TIMEOUT
     paranoid: Paranoid = False
     network: Network = False
@@ -73,11 +72,10 @@ class ReplayOptions:
     viewed: ViewOptions
     complete: Annotated[
         Path | None,
-        typer.Option(
-            "--complete",
-            metavar="FILE.mcap",
-            rich_help_panel=OUTPUT,
-            help="Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+        option(
+            "--complete FILE.mcap",
+            "Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+            OUTPUT,
         ),
     ] = None
     overwrite: Replace = False
@@ -126,7 +124,7 @@ def replay(recording: AnyRecording, options: ReplayOptions) -> None:
     began = time.monotonic()
     from dataflow.supervision.early_nursery import early_nursery
 
-    with friendly_errors(), ExitStack() as stack:
+    with ExitStack() as stack:
         _check(existing_recording(recording), options)
         find_modules_in(options.path)
         early = None if options.complete is not None else stack.enter_context(early_nursery())

@@ -8,20 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from dataflow.cli.commands.playback import keys
-from dataflow.cli.support.arguments import (
-    FLAG,
-    GraphFile,
-    ModuleFolders,
-    Settings,
-    existing,
-    find_modules_in,
-    graph_file,
-)
+from dataflow.cli.support.arguments import GraphFile, ModuleFolders, Settings, existing, find_modules_in, graph_file
 from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
-from dataflow.cli.support.output import fail, friendly_errors
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import fail
 from dataflow.cli.support.run_options import (
     PLACEMENT,
     TIMEOUT,
@@ -53,38 +44,28 @@ class RunOptions:
     path: ModuleFolders = None
     listen: Listen = None
     keys: Keys = None
-    here: Annotated[
-        bool,
-        typer.Option(
-            "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, without regard to `machine:`."
-        ),
-    ] = False
+    here: Annotated[bool, option("--here", "Run everything here, without regard to `machine:`.", PLACEMENT)] = False
     rate: Rate = None
     step: Step = False
     timeout: Timeout = TIMEOUT
     live: Annotated[
         bool,
-        typer.Option(
+        option(
             "--live",
-            metavar=FLAG,
-            help="Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
+            "Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
             "`live:` policies say. Everything dropped is counted and recorded.",
         ),
     ] = False
     paranoid: Paranoid = False
-    chaos: Annotated[
-        Path | None,
-        typer.Option("--chaos", metavar="PLAN.yaml", help="Let the faults of a plan happen; implies --live."),
-    ] = None
-    chaos_seed: Annotated[
-        int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
-    ] = None
+    chaos: Annotated[Path | None, option("--chaos PLAN.yaml", "Let the faults of a plan happen; implies --live.")] = (
+        None
+    )
+    chaos_seed: Annotated[int | None, option("--chaos-seed N", "Another seed than the plan's own.")] = None
     log_level: Annotated[
         str | None,
-        typer.Option(
-            "--log-level",
-            metavar="LEVEL",
-            help="The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
+        option(
+            "--log-level LEVEL",
+            "The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
             "Environment: DATAFLOW_LOG_LEVEL.",
         ),
     ] = None
@@ -127,7 +108,7 @@ def run(graph: GraphFile, options: RunOptions) -> None:
         raise fail(f"--log-level {options.log_level}: expected one of {', '.join(LOG_LEVELS)}")
     file = graph_file(graph)
     find_modules_in(options.path)
-    with early_nursery() as early, friendly_errors():
+    with early_nursery() as early:
         from dataflow.graph import load_graph
         from dataflow.process.log_pipe import LEVEL_VARIABLE
         from dataflow.supervision.run import run as run_graph

@@ -13,25 +13,9 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.support.again import CodeOptions
-from dataflow.cli.support.arguments import (
-    FLAG,
-    Json,
-    check_offset,
-    existing,
-    offset,
-    output_file,
-)
-from dataflow.cli.support.output import (
-    COULD_NOT_RUN,
-    DIFFERENT,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    own_traceback,
-    print_json,
-    say,
-)
+from dataflow.cli.support.arguments import Json, check_offset, existing, offset, output_file
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import COULD_NOT_RUN, DIFFERENT, err, fail, out, own_traceback, print_json, say
 from dataflow.cli.support.run_options import MakeEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:
@@ -53,71 +37,42 @@ class VerifyOptions:
     """The options of `dataflow verify`, in the order of its help."""
 
     code: CodeOptions
-    first: Annotated[
-        str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
-    ] = None
-    only: Annotated[
-        list[str] | None,
-        typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
-    ] = None
+    first: Annotated[str | None, option("--from OPERATOR", "Only this operator and what follows from it.")] = None
+    only: Annotated[list[str] | None, option("--only OPERATOR", "Only this operator; may be given several times.")] = (
+        None
+    )
     tolerance: Annotated[
         float | None,
-        typer.Option(
-            "--tolerance",
-            metavar="T",
-            help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
+        option(
+            "--tolerance T",
+            "Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
             "inputs. Reported as within tolerance, never as identical.",
         ),
     ] = None
     start: Annotated[
         float | None,
-        typer.Option(
-            "--start",
-            metavar="TIME",
-            parser=offset,
-            help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
+        option(
+            "--start TIME",
+            "Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
             "holds there.",
+            parser=offset,
         ),
     ] = None
     baseline: Annotated[
         Path | None,
-        typer.Option(
-            "--baseline",
-            metavar="FILE.json",
-            rich_help_panel=_GATE,
-            help="Outcomes that are accepted although they are not what was recorded.",
-        ),
+        option("--baseline FILE.json", "Outcomes that are accepted although they are not what was recorded.", _GATE),
     ] = None
-    accept: Annotated[
-        bool,
-        typer.Option(
-            "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
-        ),
-    ] = False
-    junit: Annotated[
-        Path | None,
-        typer.Option(
-            "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
-        ),
-    ] = None
+    accept: Annotated[bool, option("--accept", "Write what differs now into the --baseline file.", _GATE)] = False
+    junit: Annotated[Path | None, option("--junit FILE.xml", "Write the results as JUnit XML (replaced).", _GATE)] = (
+        None
+    )
     jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs",
-            "-j",
-            metavar="N",
-            help="Worker processes. Default: one for each core, fewer where little is to do.",
-        ),
+        int | None, option("--jobs -j N", "Worker processes. Default: one for each core, fewer where little is to do.")
     ] = None
-    repeat: Annotated[
-        int,
-        typer.Option("--repeat", metavar="N", help="Verify up to N times, until something differs; gives the odds."),
-    ] = 1
+    repeat: Annotated[int, option("--repeat N", "Verify up to N times, until something differs; gives the odds.")] = 1
     make_effects: MakeEffects = False
     paranoid: Paranoid = False
-    why: Annotated[
-        bool, typer.Option("--why", metavar=FLAG, help="Find the causes: run each culprit alone, 8 times at most.")
-    ] = False
+    why: Annotated[bool, option("--why", "Find the causes: run each culprit alone, 8 times at most.")] = False
     quiet: Quiet = False
     json: Json = False
 
@@ -142,9 +97,7 @@ class VerifyOptions:
 
 
 def verify(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
-    ],
+    recordings: Annotated[list[Path], argument("RECORDING", "Recordings (.mcap), or folders of them.")],
     options: VerifyOptions,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
@@ -177,21 +130,20 @@ def verify(
     """
     from dataflow.verification.workers.prestart import early_workers
 
-    with friendly_errors():
-        options.check()
-        _check_files(recordings, options.junit, options.baseline)
-        with early_workers(options.jobs) as early:  # while this process imports what it needs itself
-            from dataflow.verification.gate import recordings_in
+    options.check()
+    _check_files(recordings, options.junit, options.baseline)
+    with early_workers(options.jobs) as early:  # while this process imports what it needs itself
+        from dataflow.verification.gate import recordings_in
 
-            known = None if options.baseline is None else _loaded(options.baseline)
-            graph = options.code.load()
-            found = recordings_in(recordings)
-            single = len(recordings) == 1 and recordings[0] == found[0][0]
-            checked = _check(found, known, graph, early, options, single=single)
-            reasons = [_reasons(c, options.only, graph, quiet=options.quiet) for c in checked] if options.why else []
-            _report(checked, reasons, options, single=single)
-            if known is not None:
-                _mind_baseline(known, checked, accept=options.accept, whole=not single)
+        known = None if options.baseline is None else Baseline.load(options.baseline)
+        graph = options.code.load()
+        found = recordings_in(recordings)
+        single = len(recordings) == 1 and recordings[0] == found[0][0]
+        checked = _check(found, known, graph, early, options, single=single)
+        reasons = [_reasons(c, options.only, graph, quiet=options.quiet) for c in checked] if options.why else []
+        _report(checked, reasons, options, single=single)
+        if known is not None:
+            _mind_baseline(known, checked, accept=options.accept, whole=not single)
     raise typer.Exit(_exit_code(checked, known if options.accept else None))
 
 
@@ -203,15 +155,6 @@ def _check_files(recordings: list[Path], junit: Path | None, baseline: Path | No
         output_file(junit, ".xml", overwrite=True, option="--junit")
     if baseline is not None:
         output_file(baseline, ".json", overwrite=True, option="--baseline")
-
-
-def _loaded(file: Path) -> Baseline:
-    from dataflow.verification.gate import Baseline, BaselineError
-
-    try:
-        return Baseline.load(file)
-    except BaselineError as error:
-        raise fail(str(error)) from None
 
 
 def _check(

@@ -24,7 +24,8 @@ from dataflow.cli.support.arguments import (
     output_file,
 )
 from dataflow.cli.support.drawing import Announcer, Drawn, draw_recording, open_sink, report, showing, until_interrupted
-from dataflow.cli.support.output import fail, friendly_errors, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import fail, say
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -39,19 +40,15 @@ LOOK_EVERY = 0.25
 def view(
     recording: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="RECORDING",
-            help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder. Without one: the running graph.",
+        argument(
+            "RECORDING", "A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder. Without one: the running graph."
         ),
     ] = None,
     to: Annotated[
         str,
-        typer.Option(
-            "--to",
-            "--out",
-            "-o",
-            metavar="TARGET",
-            help="spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
+        option(
+            "--to --out -o TARGET",
+            "spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
             "runs (rerun+http://127.0.0.1:9876/proxy).",
         ),
     ] = "spawn",
@@ -61,8 +58,7 @@ def view(
     every: Every = None,
     overwrite: Overwrite = False,
     modules: Annotated[
-        list[str] | None,
-        typer.Option("--import", metavar="MODULE", help="Import a module with visualisers first. May be repeated."),
+        list[str] | None, option("--import MODULE", "Import a module with visualisers first. May be repeated.")
     ] = None,
     until_end: Annotated[bool, typer.Option("--until-end", hidden=True)] = False,
 ) -> None:
@@ -79,17 +75,16 @@ def view(
       dataflow view drive.bag --to drive.rrd
       dataflow view --graph rgbd_perception --to serve
     """
-    with friendly_errors():
-        _import(modules or ())
-        if recording is not None:
-            if graph is not None or wait:
-                raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
-            path = existing_recording(recording)
-            report(draw_recording(path, _target(to, overwrite), asked, every))
-        else:
-            if replace(asked, streams=None, without=asked.without or None) != ALL:
-                raise fail("--start, --end, --without and --clock are about a recording; name one")
-            _view_running(_target(to, overwrite), asked.streams, graph, wait, every, until_end=until_end)
+    _import(modules or ())
+    if recording is not None:
+        if graph is not None or wait:
+            raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
+        path = existing_recording(recording)
+        report(draw_recording(path, _target(to, overwrite), asked, every))
+    else:
+        if replace(asked, streams=None, without=asked.without or None) != ALL:
+            raise fail("--start, --end, --without and --clock are about a recording; name one")
+        _view_running(_target(to, overwrite), asked.streams, graph, wait, every, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from dataflow.cli.support.arguments import output_file
+from dataflow.cli.support.options import option
 from dataflow.cli.support.output import fail
 from dataflow.cli.support.quantities import parsed_duration, parsed_size
 
@@ -22,30 +21,12 @@ PARTS_KEPT = 10
 
 SplitEvery = Annotated[
     str | None,
-    typer.Option(
-        "--split-every",
-        metavar="TIME",
-        rich_help_panel=RECORDING,
-        help="A new file, NAME_000.mcap and so on, after this event time: 60s, 5min.",
-    ),
+    option("--split-every TIME", "A new file, NAME_000.mcap and so on, after this event time: 60s, 5min.", RECORDING),
 ]
-SplitSize = Annotated[
-    str | None,
-    typer.Option(
-        "--split-size",
-        metavar="SIZE",
-        rich_help_panel=RECORDING,
-        help="A new file after so many bytes: 500MB, 2GB.",
-    ),
-]
+SplitSize = Annotated[str | None, option("--split-size SIZE", "A new file after so many bytes: 500MB, 2GB.", RECORDING)]
 Readable = Annotated[
     Literal["owner", "group", "all"],
-    typer.Option(
-        "--readable",
-        metavar="owner|group|all",
-        rich_help_panel=RECORDING,
-        help="Who may read the files that are written. Default: you alone.",
-    ),
+    option("--readable owner|group|all", "Who may read the files that are written. Default: you alone.", RECORDING),
 ]
 MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
 
@@ -54,42 +35,35 @@ MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
 class RecordOptions:
     """The recording of a run, and how its files are stored."""
 
-    record: Annotated[
-        Path | None,
-        typer.Option(
-            "--record", metavar="FILE.mcap", rich_help_panel=OUTPUT, help="Record the graph's streams and firings."
-        ),
-    ] = None
+    record: Annotated[Path | None, option("--record FILE.mcap", "Record the graph's streams and firings.", OUTPUT)] = (
+        None
+    )
     compression: Annotated[
         Literal["zstd", "lz4", "none"] | None,
-        typer.Option(
-            "--compression",
-            metavar="zstd|lz4|none",
-            rich_help_panel=OUTPUT,
-            help="How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. "
-            "Default: zstd.",
+        option(
+            "--compression zstd|lz4|none",
+            "How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
+            OUTPUT,
         ),
     ] = None
     split_every: SplitEvery = None
     split_size: SplitSize = None
     keep_disk: Annotated[
         str | None,
-        typer.Option(
-            "--keep-disk",
-            metavar="SIZE",
-            rich_help_panel=RECORDING,
-            help="Delete the oldest files of this recording while all of them take more than this: 20GB. It is split "
+        option(
+            "--keep-disk SIZE",
+            "Delete the oldest files of this recording while all of them take more than this: 20GB. It is split "
             "by a tenth of that, or by --split-size.",
+            RECORDING,
         ),
     ] = None
     record_failure: Annotated[
         Literal["go_on", "end"] | None,
-        typer.Option(
-            "--record-failure",
-            metavar="go_on|end",
-            rich_help_panel=RECORDING,
-            help="When the disk is full or the recorder fails: the run goes on, and what is lost is counted (default "
+        option(
+            "--record-failure go_on|end",
+            "When the disk is full or the recorder fails: the run goes on, and what is lost is counted (default "
             "of a live run), or it ends (default of any other).",
+            RECORDING,
         ),
     ] = None
     readable: Readable = "owner"
@@ -100,9 +74,9 @@ class RecordOptions:
 
         whole = {"--split-every": self.split_every, "--split-size": self.split_size, "--keep-disk": self.keep_disk}
         either = {"--record-failure": self.record_failure, "--compression": self.compression}
-        for option, given in (whole if flight else {**whole, **either}).items():
+        for name, given in (whole if flight else {**whole, **either}).items():
             if given is not None and self.record is None:
-                raise fail(f"{option} is of a recording: name one with --record")
+                raise fail(f"{name} is of a recording: name one with --record")
         kept = None if self.keep_disk is None else parsed_size("--keep-disk", self.keep_disk)
         splitting = splitting_of(self.split_every, self.split_size, self.keep_disk)
         return Storage(splitting, kept, self.record_failure, MODES[self.readable])

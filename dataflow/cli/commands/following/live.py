@@ -15,12 +15,12 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_graphs, running_streams
-from dataflow.cli.support.arguments import FLAG, Json, chosen_streams
+from dataflow.cli.support.arguments import Json, chosen_streams
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import (
     INTERRUPTED,
     count,
     fail,
-    friendly_errors,
     out,
     plural,
     print_json,
@@ -39,17 +39,15 @@ if TYPE_CHECKING:
 
 GraphName = Annotated[
     str | None,
-    typer.Option(
-        "--graph",
-        metavar="NAME",
+    option(
+        "--graph NAME",
+        "Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
         autocompletion=running_graphs,
-        help="Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
     ),
 ]
-Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
+Wait = Annotated[float, option("--wait SECONDS", "Wait so long for the graph to run.")]
 Streams = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="STREAM...", autocompletion=running_streams, help="Streams; wildcards work. Default: all."),
+    list[str] | None, argument("STREAM...", "Streams; wildcards work. Default: all.", autocompletion=running_streams)
 ]
 
 GRAPH_VARIABLE = "DATAFLOW_GRAPH"
@@ -109,8 +107,7 @@ def list_running(json: Json = False) -> None:
     from dataflow.client.attach import graph_of
     from dataflow.transport.registry import running
 
-    with friendly_errors():
-        graphs = running()
+    graphs = running()
     if json:
         print_json([_listed(found) for found in graphs])
         return
@@ -151,20 +148,15 @@ def _listed(found: RunningGraph) -> dict[str, Any]:
 
 def echo(
     streams: Streams = None,
-    limit: Annotated[
-        int | None, typer.Option("--count", "-n", metavar="N", help="Stop after so many messages.")
-    ] = None,
-    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="Stop after one message: --count 1.")] = False,
+    limit: Annotated[int | None, option("--count -n N", "Stop after so many messages.")] = None,
+    once: Annotated[bool, option("--once", "Stop after one message: --count 1.")] = False,
     fields: Annotated[
-        list[str] | None,
-        typer.Option("--field", "-f", metavar="NAME", help="Print this field alone; may be given several times."),
+        list[str] | None, option("--field -f NAME", "Print this field alone; may be given several times.")
     ] = None,
-    full: Annotated[bool, typer.Option("--full", metavar=FLAG, help="Print long arrays and lists whole.")] = False,
+    full: Annotated[bool, option("--full", "Print long arrays and lists whole.")] = False,
     graph: GraphName = None,
     wait: Wait = 0.0,
-    json: Annotated[
-        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line: all data, numbers unrounded.")
-    ] = False,
+    json: Annotated[bool, option("--json", "One JSON object a line: all data, numbers unrounded.")] = False,
 ) -> None:
     """Print the messages of a running graph, as they come.
 
@@ -186,7 +178,7 @@ def echo(
         if limit not in (None, 1):
             raise fail(f"--once is --count 1; --count {limit} contradicts it")
         limit = 1
-    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, graph, wait) as (found, client):
         printed = 0
         try:
             while limit is None or printed < limit:
@@ -267,11 +259,8 @@ class _Rate:
 
 def hz(
     streams: Streams = None,
-    duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
-    window: Annotated[
-        float | None,
-        typer.Option("--window", metavar="SECONDS", help="Rates over the last so many seconds."),
-    ] = None,
+    duration: Annotated[float | None, option("--seconds SECONDS", "Stop after so long.")] = None,
+    window: Annotated[float | None, option("--window SECONDS", "Rates over the last so many seconds.")] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Json = False,
@@ -294,7 +283,7 @@ def hz(
         raise fail(f"--window {window:g}: expected seconds, more than 0")
     rates: dict[str, _Rate] = {}
     stopped = False
-    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, graph, wait) as (found, client):
         deadline = None if duration is None else time.monotonic() + duration
         try:
             _measure(rates, found, client, deadline, window, shown=not json and out.is_terminal)

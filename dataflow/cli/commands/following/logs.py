@@ -13,8 +13,9 @@ from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
 from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph, running_graph
-from dataflow.cli.support.arguments import FLAG, existing_recording
-from dataflow.cli.support.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
+from dataflow.cli.support.arguments import existing_recording
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import INTERRUPTED, fail, out, print_json_line, say
 
 if TYPE_CHECKING:
     from dataflow.recording import LogLine
@@ -25,31 +26,21 @@ _STYLES = {"debug": "dim", "info": "", "warning": "yellow", "error": "red", "fat
 
 _Operators = Annotated[
     list[str] | None,
-    typer.Option(
-        "--operator",
-        metavar="NAME",
-        autocompletion=running_operators,
-        help="Only this operator or process. May be repeated.",
-    ),
+    option("--operator NAME", "Only this operator or process. May be repeated.", autocompletion=running_operators),
 ]
 
 
 def logs(
     recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="[RECORDING|RUN]", help="A recording (.mcap), or the name of a running graph."),
+        Path | None, argument("[RECORDING|RUN]", "A recording (.mcap), or the name of a running graph.")
     ] = None,
     operators: _Operators = None,
-    level: Annotated[
-        str, typer.Option("--level", metavar="LEVEL", help="Only this level and worse: " + ", ".join(LEVELS) + ".")
-    ] = "debug",
-    follow: Annotated[
-        bool, typer.Option("--follow", "-f", metavar=FLAG, help="Go on with what comes, until the graph ends.")
-    ] = False,
-    last: Annotated[int | None, typer.Option("--last", "-n", metavar="N", help="Only the last N lines.")] = None,
+    level: Annotated[str, option("--level LEVEL", "Only this level and worse: " + ", ".join(LEVELS) + ".")] = "debug",
+    follow: Annotated[bool, option("--follow -f", "Go on with what comes, until the graph ends.")] = False,
+    last: Annotated[int | None, option("--last -n N", "Only the last N lines.")] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
-    json: Annotated[bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line.")] = False,
+    json: Annotated[bool, option("--json", "One JSON object a line.")] = False,
 ) -> None:
     """Show what operators have logged and printed: of the running graph, or of a recording.
 
@@ -70,23 +61,22 @@ def logs(
         raise fail(f"--last {last}: expected 1 or more")
     if last is not None and follow:
         raise fail("--last shows what is there, --follow what comes: leave one out")
-    with friendly_errors():
-        name = graph
-        if recording is not None and not recording.exists() and recording.suffix != ".mcap":
-            if graph is not None:
-                raise fail(f"{recording} and --graph {graph} both name a running graph; leave one out")
-            name, recording = str(recording), None
-        if recording is not None and (follow or graph is not None or wait):
-            raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
-        lines = _running(name, wait, follow=follow) if recording is None else _recorded(existing_recording(recording))
-        wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
-        shown = 0
-        try:
-            for line in _last(wanted, last):
-                shown += 1
-                _print(line, json=json)
-        except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+    name = graph
+    if recording is not None and not recording.exists() and recording.suffix != ".mcap":
+        if graph is not None:
+            raise fail(f"{recording} and --graph {graph} both name a running graph; leave one out")
+        name, recording = str(recording), None
+    if recording is not None and (follow or graph is not None or wait):
+        raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
+    lines = _running(name, wait, follow=follow) if recording is None else _recorded(existing_recording(recording))
+    wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
+    shown = 0
+    try:
+        for line in _last(wanted, last):
+            shown += 1
+            _print(line, json=json)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
     if not shown and not json:
         _report_nothing(recording, operators, level)
 

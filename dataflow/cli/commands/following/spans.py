@@ -12,7 +12,8 @@ from rich.markup import escape
 
 from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
 from dataflow.cli.support.arguments import ModuleFolders, Overwrite, existing_recording, find_modules_in, output_file
-from dataflow.cli.support.output import INTERRUPTED, count, fail, friendly_errors, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import INTERRUPTED, count, fail, say
 
 if TYPE_CHECKING:
     from dataflow.client.span_sender import SpanSender
@@ -30,17 +31,12 @@ NOTE_EVERY = 10.0
 
 def spans(
     recording: Annotated[
-        Path | None, typer.Argument(metavar="RECORDING", help="A recording (.mcap). Without one: the running graph.")
+        Path | None, argument("RECORDING", "A recording (.mcap). Without one: the running graph.")
     ] = None,
     to: Annotated[
         str,
-        typer.Option(
-            "--to",
-            "--out",
-            "-o",
-            metavar="TARGET",
-            help="FILE.jsonl, or the URL of a collector (http://127.0.0.1:4318).",
-            show_default=False,
+        option(
+            "--to --out -o TARGET", "FILE.jsonl, or the URL of a collector (http://127.0.0.1:4318).", show_default=False
         ),
     ] = "",
     folders: ModuleFolders = None,
@@ -67,12 +63,11 @@ def spans(
     if recording is not None and (graph is not None or wait):
         raise fail("--graph and --wait are about a running graph; leave them out for a recording")
     find_modules_in(folders)
-    with friendly_errors():
-        write = _target(to, overwrite)
-        if recording is not None:
-            _export(recording, write, to)
-        else:
-            _follow(followed_graph(graph, wait), write, to)
+    write = _target(to, overwrite)
+    if recording is not None:
+        _export(recording, write, to)
+    else:
+        _follow(followed_graph(graph, wait), write, to)
 
 
 def _target(to: str, overwrite: bool) -> Callable[[str], int]:
