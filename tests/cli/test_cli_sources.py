@@ -199,6 +199,30 @@ def test_every_command_takes_damage_in_one_way(
             assert said in " ".join((told.stdout + told.stderr).split()), words
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "convert FILE OUT.mcap --to mcap --clock log --json",
+        "convert FILE OUT --to csv --clock log --json",
+        "convert FILE OUT --to ros2 --stream /pose --json",
+        "lint FILE --json",
+        "cut FILE -o OUT.mcap --from 0 --json",
+        "filter FILE -o OUT.mcap --stream /pose --json",
+    ],
+)
+def test_damaged_chunk_is_passed_over_and_counted_unless_strict(dataflow, tmp_path: Path, words: str) -> None:
+    path = damaged_chunk(tmp_path / "a.mcap")
+    places = {"FILE": path} | {name: tmp_path / name for name in ("OUT", "OUT.mcap", "OTHER", "OTHER.mcap")}
+
+    done = dataflow(*(places.get(word, word) for word in words.split()), code=1)
+
+    assert "12 messages lost to damage" in done.stdout + done.stderr
+    assert "chunk 2 at byte" in done.stdout
+    if words.startswith("convert"):
+        strict = (places.get(word, word) for word in words.replace("OUT", "OTHER").split())
+        assert "chunk 2 at byte" in dataflow(*strict, "--strict", code=2).stderr
+
+
 @pytest.mark.parametrize("make", [damaged_chunk, bad_message])
 def test_messages_that_cannot_be_read_are_passed_over_and_counted(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     path = make(tmp_path / "a.mcap")
