@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_mcap import foreign_mcap
 from made_bags import SECOND, header, ros, write_ros1, write_ros2, xyz, xyzw
 
 START = 1_700_000_000 * SECOND
@@ -191,17 +192,12 @@ def test_options_of_bags_are_refused_when_a_recording_is_replayed(dataflow, reco
 
 
 def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    file = tmp_path / "drive.mcap"
-    with file.open("wb") as opened:
-        writer = Writer(opened)
-        writer.start()
-        channel = writer.register_channel("/a", "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.add_metadata("vehicle", {"name": "truck 7"})
-        writer.add_attachment(1, 1, "calib.txt", "text/plain", b"P0: 1")
-        writer.finish()
+    file = foreign_mcap(
+        tmp_path / "drive.mcap",
+        [("/a", 1, b"{}")],
+        metadata={"vehicle": {"name": "truck 7"}},
+        attachments=[("calib.txt", "text/plain", 1, 1, b"P0: 1")],
+    )
 
     told = json.loads(dataflow("info", file, "--json").stdout)
 
@@ -211,7 +207,7 @@ def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path
     assert "truck 7" in dataflow("info", file, "--metadata").stdout
 
 
-def test_a_bag_without_metadata_records_says_so(dataflow, tmp_path: Path) -> None:
+def test_bag_without_metadata_records_is_reported(dataflow, tmp_path: Path) -> None:
     from made_bags import ROS1
 
     text = ros("std_msgs/String", ROS1, data="hello")

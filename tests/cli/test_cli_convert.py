@@ -252,7 +252,7 @@ def test_recording_without_readable_message_is_refused_with_reason(dataflow, tmp
     assert not (tmp_path / "o.mcap").exists()
 
 
-def test_fewer_messages_than_promised_fail_the_command_and_are_said(dataflow, tmp_path: Path) -> None:
+def test_fewer_messages_than_promised_fail_and_are_reported(dataflow, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     with sqlite3.connect(folder / "bag.db3") as database:
         database.execute("delete from messages where id > 4")
@@ -269,7 +269,7 @@ def test_fewer_messages_than_promised_fail_the_command_and_are_said(dataflow, tm
         assert recording.streams["imu"].count == 4
 
 
-def test_repairs_are_said_and_stand_in_the_metadata(dataflow, tmp_path: Path) -> None:
+def test_repairs_are_reported_and_in_the_metadata(dataflow, tmp_path: Path) -> None:
     rows = [("/imu", s, ros("sensor_msgs/Imu", header=header(STAMPS[i // 2]))) for i, s in enumerate(STAMPS)]
     bag = write_ros2(tmp_path / "bag", rows)
 

@@ -14,7 +14,7 @@ Recorded = tuple[Path, dict[str, Any]]
 
 
 @pytest.mark.long
-def test_a_cut_is_written_and_says_what_goes_along(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+def test_cut_is_written_and_reports_its_content(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "part.mcap"
 
     told = json.loads(dataflow("cut", recorded[0], "--from", "50ms", "--duration", "0.1", "-o", path, "--json").stdout)
@@ -47,7 +47,7 @@ def test_a_cut_that_cannot_be_is_refused(
 
 
 @pytest.mark.long
-def test_a_filter_keeps_what_it_is_told_to(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+def test_filter_keeps_chosen_streams(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "part.mcap"
 
     dataflow("filter", recorded[0], "--stream", "left/*", "-o", path)

@@ -178,9 +178,7 @@ def test_a_command_takes_its_options(dataflow, places: dict[str, str], tmp_path:
 
 
 @pytest.mark.parametrize("line", UNANSWERED, ids=lambda line: " ".join(line.split()[:2]))
-def test_a_command_for_a_running_graph_says_that_none_runs(
-    dataflow, places: dict[str, str], tmp_path: Path, line: str
-) -> None:
+def test_command_without_running_graph_is_refused(dataflow, places: dict[str, str], tmp_path: Path, line: str) -> None:
     said = dataflow(*typed(line, places, tmp_path), code=2).stderr
 
     assert "Usage" not in said
@@ -188,7 +186,7 @@ def test_a_command_for_a_running_graph_says_that_none_runs(
 
 
 @pytest.mark.parametrize("line", REMOTE, ids=lambda line: " ".join(line.split()[:2]))
-def test_a_command_for_a_graph_of_another_machine_names_the_endpoint_that_does_not_answer(
+def test_unreachable_endpoint_is_named(
     dataflow, places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
     monkeypatch.setattr(keys, "CONNECT_WITHIN", 50)
@@ -197,7 +195,7 @@ def test_a_command_for_a_graph_of_another_machine_names_the_endpoint_that_does_n
 
 
 @pytest.mark.parametrize(("line", "reason"), REFUSED, ids=lambda text: text.split()[0])
-def test_a_command_that_cannot_begin_names_the_reason(
+def test_command_that_cannot_begin_names_the_reason(
     dataflow, places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, reason: str
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers are those of a process that is the agent

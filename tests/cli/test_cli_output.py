@@ -230,7 +230,7 @@ def lossy_report() -> RunReport:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_a_report_tells_drops_timeouts_and_late_messages_apart(width: int) -> None:
+def test_report_distinguishes_drops_timeouts_and_late_messages(width: int) -> None:
     console = Console(file=io.StringIO(), width=width)
 
     print_report(console, lossy_report(), verbose=True)
@@ -362,7 +362,7 @@ def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkey
         ("KeyError: 'a'", False),
     ],
 )
-def test_an_error_about_a_file_is_told_by_its_class(last: str, file: bool) -> None:
+def test_file_errors_are_recognised_by_class(last: str, file: bool) -> None:
     trace = f'Traceback (most recent call last):\n  File "x.py", line 1, in setup\n    read()\n    ^^^^^^\n{last}\n'
 
     assert about_a_file(trace) is file
@@ -384,7 +384,7 @@ def test_expected_errors_end_with_their_exit_code(capsys, error: Exception, code
     assert capsys.readouterr().err.startswith(told)
 
 
-def test_a_start_says_which_processes_it_waits_for() -> None:
+def test_start_names_processes_it_waits_for() -> None:
     status = Status(waiting=("camera", "cloud", "detector", "odometry", "@recorder"))
     console = Console(file=io.StringIO(), width=100)
     with shown(console, RunDisplay(console), quiet=False) as watch:

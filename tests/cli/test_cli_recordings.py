@@ -130,7 +130,7 @@ def test_a_view_that_cannot_be_is_refused(
     assert not Path("x.rrd").exists()
 
 
-def test_a_missing_recording_is_told_before_a_missing_display(dataflow, tmp_path: Path) -> None:
+def test_missing_recording_is_reported_before_missing_display(dataflow, tmp_path: Path) -> None:
     assert "no file" in dataflow("view", tmp_path / "run.mcap", code=2).stderr
 
 

@@ -91,7 +91,7 @@ def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
     assert replayed["streams"]["test/left/fast"]["messages"] == 10  # stamps 0.10, 0.11 ... 0.19 s
 
 
-def test_verification_of_a_recording_says_identical(dataflow, recorded) -> None:
+def test_unchanged_recording_verifies_as_identical(dataflow, recorded) -> None:
     path, _ = recorded
 
     told = dataflow("verify", path, "--jobs", "1", "--json", "-q")
@@ -229,25 +229,18 @@ def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_i
     assert "failed" in dataflow("info", path).stdout
 
 
+def started(*words: object, folder: Path | None = None) -> subprocess.Popen[str]:
+    """A command in a process, in `folder`."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(PACKAGE / "tests" / "runtime")])}
+    command = [sys.executable, "-m", "dataflow.cli.main", *map(str, words)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, cwd=folder, env=env, text=True, **pipes)  # type: ignore[call-overload]
+
+
 def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -> None:
     path = tmp_path / "interrupted.mcap"
-    command = [
-        "run",
-        str(small),
-        "--set",
-        "count=100000",
-        "--set",
-        "sleep=0.02",
-        "--record",
-        str(path),
-        "--one-process",
-    ]
-    running = subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    settings = ("--set", "count=100000", "--set", "sleep=0.02", "--one-process")
+    running = started("run", small, *settings, "--record", path)
     try:
         assert running.stderr is not None
         assert any(line.startswith("running") for line in running.stderr)
@@ -320,14 +313,7 @@ def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) 
         "graph: slow\noperators:\n  left: {use: 'runtime_operators:Counter'}\n"
         "  last: {use: 'slow_setup:Slow', inputs: {x: left/fast}}\n"
     )
-    running = subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", "run", "slow.yaml", "--record", "run.mcap"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(PACKAGE / "tests" / "runtime")])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    running = started("run", "slow.yaml", "--record", "run.mcap", folder=tmp_path)
     try:
         deadline = time.monotonic() + 60
         while not (tmp_path / "begun").exists() and time.monotonic() < deadline:
@@ -349,9 +335,7 @@ def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
-    dataflow, small: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_saved_view_is_opened_where_there_is_a_display(dataflow, small: Path, tmp_path: Path, monkeypatch) -> None:
     saved, noted = tmp_path / "run.rrd", tmp_path / "opened"
     viewer = tmp_path / "rerun"
     viewer.write_text(f'#!/bin/sh\nfor last; do :; done\necho "$last" > {noted}.new && mv {noted}.new {noted}\n')

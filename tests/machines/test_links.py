@@ -173,20 +173,22 @@ def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Pat
     end(stranger)
 
 
-def test_an_endpoint_without_keys_is_refused_beyond_a_socket_of_this_user(keys: Path) -> None:
-    with pytest.raises(NetworkError, match=r"'tcp/127\.0\.0\.1:7447' needs keys: make them with `dataflow keys new"):
-        settings(None, "tcp/127.0.0.1:7447")
-    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
-        settings(keys / "laptop", "tcp/0.0.0.0:7447")
-    with pytest.raises(NetworkError, match=r"no certificate\.pem, key\.pem"):
-        settings(keys / "authority", "tls/127.0.0.1:7447")
+ADDRESSED = r"expected tls/<address>:<port>"
+
+
+@pytest.mark.parametrize(
+    ("held", "endpoint", "reason"),
+    [
+        (None, "tcp/127.0.0.1:7447", r"'tcp/127\.0\.0\.1:7447' needs keys: make them with `dataflow keys new"),
+        ("authority", "tls/127.0.0.1:7447", r"no certificate\.pem, key\.pem"),
+        ("laptop", "tcp/0.0.0.0:7447", ADDRESSED),
+        *(("tools", at, ADDRESSED) for at in ("tls/10.0.0.2", "tls/:7447", "tls/10.0.0.2:port", "tcp/10.0.0.2:7447")),
+    ],
+)
+def test_endpoint_without_keys_or_port_is_refused(keys: Path, held: str | None, endpoint: str, reason: str) -> None:
+    with pytest.raises(NetworkError, match=reason):
+        settings(held and keys / held, endpoint)  # type: ignore[arg-type]
     assert settings(None, "unixsock-stream//run/meet") == {}
-
-
-@pytest.mark.parametrize("endpoint", ["tls/10.0.0.2", "tls/:7447", "tls/10.0.0.2:port", "tcp/10.0.0.2:7447"])
-def test_an_endpoint_without_a_port_is_refused_where_it_is_connected_to(keys: Path, endpoint: str) -> None:
-    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
-        settings(keys / "tools", endpoint)
 
 
 def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.support.arguments import (
@@ -30,7 +29,7 @@ from dataflow.cli.support.arguments import (
 )
 from dataflow.cli.support.material import Quiet
 from dataflow.cli.support.options import argument, option
-from dataflow.cli.support.output import DIFFERENT, count, err, fail, out, plural, print_json, say, shown, table
+from dataflow.cli.support.output import DIFFERENT, count, counting, fail, out, plural, print_json, say, shown, table
 
 if TYPE_CHECKING:
     from dataflow.interop.account import Account
@@ -143,7 +142,7 @@ def _convert(recording: Path, output: Path, to: Format, scales: dict[str, float]
         raise fail("--action and --task are of --to lerobot and lerobot-v3")
     with (
         _opened(recording, options.chosen, wishes) as material,
-        _progress(options.quiet or options.json) as watch,
+        counting("converting", hidden=options.quiet or options.json) as watch,
         _complete(output) as place,
     ):
         done = _export(material, place, to, watch, options)
@@ -331,14 +330,3 @@ def _export(
     if to not in _MCAP:
         tell_left_out(material, to, done)
     return done
-
-
-@contextmanager
-def _progress(hidden: bool) -> Iterator[Callable[[int], None] | None]:
-    """Shows how many messages are written."""
-    if hidden or not err.is_terminal:
-        yield None
-        return
-    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
-        task = progress.add_task("converting")
-        yield lambda seen: progress.update(task, description=f"converting · {count(seen)} messages")

@@ -229,7 +229,7 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None, *, q
 
 def _report(checked: list[Checked], reasons: list[list[Why]], options: VerifyOptions, *, single: bool) -> None:
     from dataflow.cli.support.causes import print_reasons
-    from dataflow.cli.support.verdicts import explain, print_many, print_one, reservations
+    from dataflow.cli.support.verdicts import print_many, print_one
 
     found = [{"why": [one.as_json() for one in each]} for each in reasons] or [{}] * len(checked)
 
@@ -258,7 +258,7 @@ def _report(checked: list[Checked], reasons: list[list[Why]], options: VerifyOpt
     if options.junit is not None:
         from dataflow.cli.support.junit import write_junit
 
-        write_junit(options.junit, checked, explain, reservations)
+        write_junit(options.junit, checked)
 
 
 def _may_be_a_test(report: VerifyReport, operator: str, reasons: list[list[Why]]) -> bool:

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.messages import Message
     from dataflow.transport import RunningGraph, TapClient
-    from dataflow.view import Target
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Target, ViewerSink
 
 LOOK_EVERY = 0.25
 """Seconds between two looks at the log of the graph that is followed."""
@@ -119,71 +120,56 @@ def require_display() -> None:
 def _view_running(
     target: Target, streams: list[str] | None, name: str | None, wait: float, every: float | None, *, until_end: bool
 ) -> None:
+    """Draws streams of a graph until it ends; all of them with what it logs, if none are named."""
     from dataflow.client.attach import graph_of, tap
     from dataflow.graph.sections import PLACE_FRAMES
+    from dataflow.interop.account import Account
+    from dataflow.names import logs_key
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Serve
 
     if wait:
         importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
     found = running_graph(name, wait)
     running = graph_of(found)
-    chosen = chosen_streams(streams, running.streams, running.namespace)
+    chosen, logs = chosen_streams(streams, running.streams, running.namespace), not streams
     others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]
-    others = [name for name in others if name not in chosen]
+    others = [name for name in others if name not in chosen]  # not shown, but place frames
     with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
         say_followed(found)
-        _draw_running(target, client, found, running, chosen, others, every, logs=not streams, until_end=until_end)
+        with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
+            types = _types(running, [*chosen, *others], logs_key(running.namespace) if logs else None)
+            sink.open(types, showing(running, None if logs else chosen), hidden=others)
+            Announcer(sink).announce()
+            _draw_running(sink, client, found, follower if logs else None, logs_key(running.namespace))
+            client.close()
+            if isinstance(target, Serve) and not until_end:
+                say("the graph has ended; still serving until Ctrl-C")
+                until_interrupted()
+            complete = sink.close(timeout=60.0)
+    report(Drawn(sink, complete, Account()))
 
 
 def _draw_running(
-    target: Target,
-    client: TapClient,
-    found: RunningGraph,
-    running: Graph,
-    chosen: list[str],
-    others: list[str],
-    every: float | None,
-    *,
-    logs: bool,
-    until_end: bool,
+    sink: ViewerSink, client: TapClient, found: RunningGraph, follower: LogFollower | None, log_stream: str
 ) -> None:
-    """Draws the streams that were chosen until the graph ends, and what it logs with them.
-
-    `others` are not shown, but place frames.
-    """
+    """Draws what comes, and the log if it is followed, until the graph ends."""
     from dataflow.client.attach import still_runs
-    from dataflow.names import logs_key
     from dataflow.recording import LogLine
-    from dataflow.transport.log_file import LogFollower
-    from dataflow.view import Serve, as_alarm
+    from dataflow.view import as_alarm
 
-    log_stream = logs_key(running.namespace)
-    with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
-        types = _types(running, [*chosen, *others], log_stream if logs else None)
-        sink.open(types, showing(running, None if logs else chosen), hidden=others)
-        Announcer(sink).announce()
-        clock, look_due = 0, 0.0
-        while True:
-            taken = client.take(timeout=0.5)
-            if logs and time.monotonic() >= look_due:
-                look_due = time.monotonic() + LOOK_EVERY
-                for value in follower.lines():
-                    sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
-            if taken is None:
-                if not still_runs(found):
-                    break
-                continue
-            envelope = taken.decode()
-            if envelope.message is not None:
-                clock = max(clock, envelope.message.stamp)
-                sink.log(taken.stream, envelope.message)
-        client.close()
-        if isinstance(target, Serve) and not until_end:
-            say("the graph has ended; still serving until Ctrl-C")
-            until_interrupted()
-        complete = sink.close(timeout=60.0)
-    from dataflow.interop.account import Account
-
-    report(Drawn(sink, complete, Account()))
+    clock, look_due = 0, 0.0
+    while True:
+        taken = client.take(timeout=0.5)
+        if follower is not None and time.monotonic() >= look_due:
+            look_due = time.monotonic() + LOOK_EVERY
+            for value in follower.lines():
+                sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
+        if taken is not None and (message := taken.decode().message) is not None:
+            clock = max(clock, message.stamp)
+            sink.log(taken.stream, message)
+        elif taken is None and not still_runs(found):
+            return
 
 
 def _types(running: Graph, chosen: list[str], logs: str | None) -> dict[str, type[Message]]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.support.arguments import span, window
@@ -17,7 +15,7 @@ from dataflow.cli.support.execution import Outputs, execute
 from dataflow.cli.support.output import (
     DIFFERENT,
     count,
-    err,
+    counting,
     fail,
     out,
     plural,
@@ -30,8 +28,6 @@ from dataflow.cli.support.output import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from dataflow.cli.support.arguments import BagOptions
     from dataflow.cli.support.run_options import ReportOptions
     from dataflow.graph import Graph
@@ -64,7 +60,7 @@ def replay_bag(
 
     matching = match(path, graph, bag.maps or ())
     with (
-        _counting(told.quiet) as watch,
+        counting("reading times", hidden=told.quiet) as watch,
         BagStreams(path, matching.played(), bag.clock, watch=watch, strict=bag.strict) as opened,
     ):
         if not told.quiet:
@@ -119,17 +115,6 @@ def say_what_is_played(matching: Matching, opened: BagStreams) -> None:
             say(f"[yellow]{escape(played.topic)}: no place in {played.type} for {escape(', '.join(lost))}[/]")
     what = "header stamps" if opened.clock.kind == "header" else "log times"
     say(f"[dim]stamped with {what}: {escape(opened.clock.why)}[/]")
-
-
-@contextmanager
-def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
-    """Shows how many messages the first pass over a bag has seen."""
-    if quiet or not err.is_terminal:
-        yield None
-        return
-    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
-        task = progress.add_task("reading times")
-        yield lambda seen: progress.update(task, description=f"reading times · {count(seen)} messages")
 
 
 def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -206,6 +206,16 @@ def about_a_file(details: str) -> bool:
     lines = details.rpartition('\n  File "')[2].splitlines()
     raised = next((line for line in lines[1:] if not line.startswith(" ")), "")
     return details.startswith("Traceback") and raised.partition(":")[0].rpartition(".")[2] in _FILE_ERRORS
+
+
+@contextmanager
+def counting(what: str, *, hidden: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows on a terminal how many messages `what` has seen, unless it is `hidden`."""
+    if hidden or not err.is_terminal:
+        yield None
+        return
+    with err.status(what) as status:
+        yield lambda seen: status.update(f"{what} · {count(seen)} messages")
 
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:
