@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import THE_ONLY, Running, say_followed
 from dataflow.cli.support.arguments import (
     Clock,
     End,
@@ -48,8 +48,7 @@ class FoxgloveOptions:
     start: Start = None
     end: End = None
     clock: Clock = "auto"
-    graph: GraphName = None
-    wait: Wait = 0.0
+    which: Running = THE_ONLY
 
     def server(
         self, name: str, namespace: str, controls: Controls | None, shown: tuple[int, int] | None
@@ -86,7 +85,7 @@ def foxglove(
     if not 0 <= options.port < 65536:
         raise fail(f"--port {options.port}: expected 0 to 65535")
     if recording is not None:
-        if options.graph is not None or options.wait:
+        if options.which != THE_ONLY:
             raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
         _play(existing_recording(recording), options)
     else:
@@ -138,7 +137,7 @@ def _follow(options: FoxgloveOptions) -> None:
     from dataflow.client.attach import graph_of, still_runs, tap
     from dataflow.client.playback import steering
 
-    found = running_graph(options.graph, options.wait)
+    found = options.which.found()
     running = graph_of(found)
     chosen = chosen_streams(options.streams, running.streams, running.namespace)
     with ExitStack() as stack:

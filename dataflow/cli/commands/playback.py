@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json, number
 from dataflow.cli.support.options import argument
 from dataflow.cli.support.output import err, fail, out, print_json, say
@@ -141,8 +141,7 @@ def playback(
             "the graph goes.",
         ),
     ] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Pause, resume, step or pace what runs in another terminal, or in a script.
@@ -171,7 +170,7 @@ def playback(
     if action not in ACTIONS:
         raise fail(f"{action!r}: expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")
     steps, speed = _wanted(action, value)
-    found = running_graph(graph, wait)
+    found = which.found()
     answer = ask(found, None if action == "status" else action, steps, speed)
     if json:
         print_json(answer)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import THE_ONLY, Running, say_followed
 from dataflow.cli.support.arguments import (
     ALL,
     Every,
@@ -54,8 +54,7 @@ def view(
         ),
     ] = "spawn",
     asked: Selection = ALL,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     every: Every = None,
     overwrite: Overwrite = False,
     modules: Annotated[
@@ -78,14 +77,14 @@ def view(
     """
     _import(modules or ())
     if recording is not None:
-        if graph is not None or wait:
+        if which != THE_ONLY:
             raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
         path = existing_recording(recording)
         report(draw_recording(path, _target(to, overwrite), asked, every))
     else:
         if replace(asked, streams=None, without=asked.without or None) != ALL:
             raise fail("--start, --end, --without and --clock are about a recording; name one")
-        _view_running(_target(to, overwrite), asked.streams, graph, wait, every, until_end=until_end)
+        _view_running(_target(to, overwrite), asked.streams, which, every, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:
@@ -118,7 +117,7 @@ def require_display() -> None:
 
 
 def _view_running(
-    target: Target, streams: list[str] | None, name: str | None, wait: float, every: float | None, *, until_end: bool
+    target: Target, streams: list[str] | None, which: Running, every: float | None, *, until_end: bool
 ) -> None:
     """Draws streams of a graph until it ends; all of them with what it logs, if none are named."""
     from dataflow.client.attach import graph_of, tap
@@ -128,9 +127,9 @@ def _view_running(
     from dataflow.transport.log_file import LogFollower
     from dataflow.view import Serve
 
-    if wait:
+    if which.wait:
         importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
-    found = running_graph(name, wait)
+    found = which.found()
     running = graph_of(found)
     chosen, logs = chosen_streams(streams, running.streams, running.namespace), not streams
     others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]

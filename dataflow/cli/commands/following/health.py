@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json
 from dataflow.cli.support.options import option
 from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, out, print_json, say, seconds, size
@@ -41,8 +41,7 @@ def health(
     free: Annotated[float, option("--free GB", "Free space on the disk.", min=0.0)] = 1.0,
     folder: Folder = HERE,
     over: Annotated[float, option("--over SECONDS", "Time over which rates are taken.", min=0.1, max=600)] = 2.0,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Check whether a running graph does its work: for a watchdog, a container's health check, a cron job.
@@ -63,7 +62,7 @@ def health(
     from dataflow.client.attach import graph_of
     from dataflow.client.processes import processes_of
 
-    found = running_graph(graph, wait)
+    found = which.found()
     resolved = graph_of(found)
     least = _rates(rate or (), resolved.nodes)
     table = StatusTable(resolved)

@@ -37,15 +37,6 @@ if TYPE_CHECKING:
     from dataflow.transport import TapClient, TapMessage
     from dataflow.transport.registry import RunningGraph
 
-GraphName = Annotated[
-    str | None,
-    option(
-        "--graph NAME",
-        "Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
-        autocompletion=running_graphs,
-    ),
-]
-Wait = Annotated[float, option("--wait SECONDS", "Wait so long for the graph to run.")]
 Streams = Annotated[
     list[str] | None, argument("STREAM...", "Streams; wildcards work. Default: all.", autocompletion=running_streams)
 ]
@@ -56,27 +47,43 @@ HISTORY = 2000
 """Messages of a stream over which its rates are taken, at most."""
 
 
-def running_graph(name: str | None, wait: float) -> RunningGraph:
-    """Returns the running graph of that name, or the only one; prints a note if it has to wait. Raises `NotRunning`."""
-    from dataflow.client.attach import NotRunning, find_running
+@dataclass(frozen=True, slots=True)
+class Running:
+    """Names a running graph."""
 
-    name = name or os.environ.get(GRAPH_VARIABLE) or None
-    if not 0 <= wait < 1e9:
-        raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
-    try:
-        return find_running(name)
-    except NotRunning:
-        if not wait:
-            raise
-    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else escape(name)} to run")
-    return find_running(name, wait=wait)
+    graph: Annotated[
+        str | None,
+        option(
+            "--graph NAME",
+            "Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
+            autocompletion=running_graphs,
+        ),
+    ] = None
+    wait: Annotated[float, option("--wait SECONDS", "Wait so long for the graph to run.")] = 0.0
+
+    def found(self) -> RunningGraph:
+        """The running graph of that name, or the only one; prints a note if it has to wait. Raises `NotRunning`."""
+        from dataflow.client.attach import NotRunning, find_running
+
+        name = self.graph or os.environ.get(GRAPH_VARIABLE) or None
+        if not 0 <= self.wait < 1e9:
+            raise fail(f"--wait {self.wait:g}: expected seconds, 0 or more")
+        try:
+            return find_running(name)
+        except NotRunning:
+            if not self.wait:
+                raise
+        say(f"waiting up to {seconds(self.wait)} for {'a graph' if name is None else escape(name)} to run")
+        return find_running(name, wait=self.wait)
+
+    def followed(self) -> RunningGraph:
+        """The same, which is named on standard error."""
+        found = self.found()
+        say_followed(found)
+        return found
 
 
-def followed_graph(name: str | None, wait: float) -> RunningGraph:
-    """The running graph of that name, or the only one, which it names. Raises `NotRunning`."""
-    found = running_graph(name, wait)
-    say_followed(found)
-    return found
+THE_ONLY = Running()
 
 
 def say_followed(found: RunningGraph) -> None:
@@ -85,11 +92,11 @@ def say_followed(found: RunningGraph) -> None:
 
 
 @contextmanager
-def tapped(streams: list[str] | None, name: str | None, wait: float) -> Iterator[tuple[RunningGraph, TapClient]]:
+def tapped(streams: list[str] | None, which: Running) -> Iterator[tuple[RunningGraph, TapClient]]:
     """The running graph, and a lossy copy of those of its streams that were asked for."""
     from dataflow.client.attach import graph_of, tap
 
-    found = followed_graph(name, wait)
+    found = which.followed()
     graph = graph_of(found)
     chosen = chosen_streams(streams, graph.streams, graph.namespace)
     with tap(found, [f"/{stream}" for stream in chosen] if streams else ["**"]) as client:
@@ -154,8 +161,7 @@ def echo(
         list[str] | None, option("--field -f NAME", "Print this field alone; may be given several times.")
     ] = None,
     full: Annotated[bool, option("--full", "Print long arrays and lists whole.")] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Annotated[bool, option("--json", "One JSON object a line: all data, numbers unrounded.")] = False,
 ) -> None:
     """Print the messages of a running graph, as they come.
@@ -178,7 +184,7 @@ def echo(
         if limit not in (None, 1):
             raise fail(f"--once is --count 1; --count {limit} contradicts it")
         limit = 1
-    with tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, which) as (found, client):
         printed = 0
         try:
             while limit is None or printed < limit:
@@ -261,8 +267,7 @@ def hz(
     streams: Streams = None,
     duration: Annotated[float | None, option("--seconds SECONDS", "Stop after so long.")] = None,
     window: Annotated[float | None, option("--window SECONDS", "Rates over the last so many seconds.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Show the rates of a running graph's streams.
@@ -283,7 +288,7 @@ def hz(
         raise fail(f"--window {window:g}: expected seconds, more than 0")
     rates: dict[str, _Rate] = {}
     stopped = False
-    with tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, which) as (found, client):
         deadline = None if duration is None else time.monotonic() + duration
         try:
             _measure(rates, found, client, deadline, window, shown=not json and out.is_terminal)

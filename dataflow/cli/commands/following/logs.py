@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import existing_recording
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import INTERRUPTED, fail, out, print_json_line, say
@@ -38,8 +39,7 @@ def logs(
     level: Annotated[str, option("--level LEVEL", "Only this level and worse: " + ", ".join(LEVELS) + ".")] = "debug",
     follow: Annotated[bool, option("--follow -f", "Go on with what comes, until the graph ends.")] = False,
     last: Annotated[int | None, option("--last -n N", "Only the last N lines.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Annotated[bool, option("--json", "One JSON object a line.")] = False,
 ) -> None:
     """Show what operators have logged and printed: of the running graph, or of a recording.
@@ -61,14 +61,13 @@ def logs(
         raise fail(f"--last {last}: expected 1 or more")
     if last is not None and follow:
         raise fail("--last shows what is there, --follow what comes: leave one out")
-    name = graph
     if recording is not None and not recording.exists() and recording.suffix != ".mcap":
-        if graph is not None:
-            raise fail(f"{recording} and --graph {graph} both name a running graph; leave one out")
-        name, recording = str(recording), None
-    if recording is not None and (follow or graph is not None or wait):
+        if which.graph is not None:
+            raise fail(f"{recording} and --graph {which.graph} both name a running graph; leave one out")
+        which, recording = replace(which, graph=str(recording)), None
+    if recording is not None and (follow or which != THE_ONLY):
         raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
-    lines = _running(name, wait, follow=follow) if recording is None else _recorded(existing_recording(recording))
+    lines = _running(which, follow=follow) if recording is None else _recorded(existing_recording(recording))
     wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
     shown = 0
     try:
@@ -118,13 +117,13 @@ def _report_unknown(path: Path, names: list[str]) -> None:
             say(f"[yellow]no operator or process {escape(repr(name))} is in the recording:[/] {escape(hint)}")
 
 
-def _running(name: str | None, wait: float, *, follow: bool) -> Iterator[LogLine]:
+def _running(which: Running, *, follow: bool) -> Iterator[LogLine]:
     """The lines of a running graph; with `follow` until it has ended."""
     from dataflow.client.attach import still_runs
     from dataflow.recording import LogLine
     from dataflow.transport.log_file import LogFollower
 
-    found = followed_graph(name, wait) if follow else running_graph(name, wait)
+    found = which.followed() if follow else which.found()
     follower = LogFollower(found.pid)
     try:
         while True:

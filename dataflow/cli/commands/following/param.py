@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json, OutInstead, existing, find_modules_in, named_once
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import DIFFERENT, fail, out, print_json, print_json_line, say, table
@@ -25,8 +25,7 @@ Timeout = Annotated[float, option("--timeout SECONDS", "Wait so long for an answ
 def set_(
     parameter: Annotated[str, argument("OPERATOR.NAME", "Such as detector.score_threshold.")],
     value: Annotated[str, argument("VALUE", "A YAML value: 0.3, true, near, [1, 2].")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -46,7 +45,7 @@ def set_(
     from dataflow.client.processes import processes_of
 
     _check(timeout)
-    found = running_graph(graph, wait)
+    found = which.found()
     operator, name = _split(parameter, _graph(found))
     if not name:
         raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
@@ -61,8 +60,7 @@ def set_(
 
 def get(
     parameter: Annotated[str | None, argument("OPERATOR[.NAME]", "One parameter, or all of an operator.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -78,7 +76,7 @@ def get(
     """
     from dataflow.graph.problems import did_you_mean
 
-    operators, name, values = _asked(parameter, graph, wait, timeout)
+    operators, name, values = _asked(parameter, which, timeout)
     if name:
         for operator, parameters in values.items():
             if name not in parameters:
@@ -100,8 +98,7 @@ def get(
 
 def list_(
     every: Annotated[bool, option("--all", "Also those that cannot change while the graph runs.")] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -112,9 +109,9 @@ def list_(
       dataflow param list
       dataflow param list --all --json
     """
-    found = running_graph(graph, wait)
+    found = which.found()
     resolved = _graph(found)
-    operators, _, values = _asked(None, graph, wait, timeout)
+    operators, _, values = _asked(None, which, timeout)
     rows = [
         {"parameter": f"{op}.{name}", "value": p.value, "tunable": p.tunable, **_declared(resolved, op, name)}
         for op, parameters in values.items()
@@ -139,8 +136,7 @@ def dump(
     out_option: OutInstead = None,
     every: Annotated[bool, option("--all", "Also those that cannot change while the graph runs.")] = False,
     overwrite: Annotated[bool, option("--overwrite", "Replace a file that exists.")] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
 ) -> None:
     """Write the values that parameters have now as YAML: operator, name, value. `param load` sets them again.
@@ -155,7 +151,7 @@ def dump(
     file = named_once("FILE", file, out_option)
     if file is not None and file.exists() and not overwrite:
         raise fail(f"{file} exists; name another file, or replace it with --overwrite")
-    operators, _, values = _asked(None, graph, wait, timeout)
+    operators, _, values = _asked(None, which, timeout)
     lines: list[str] = []
     for operator, parameters in values.items():
         shown = {name: p.value for name, p in parameters.items() if p.tunable or every}
@@ -172,8 +168,7 @@ def dump(
 
 def load(
     file: Annotated[Path, argument("FILE", "YAML as `param dump` writes it.")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
 ) -> None:
     """Set the parameters that a file names, as far as their values differ.
@@ -190,7 +185,7 @@ def load(
     from dataflow.graph.problems import did_you_mean
 
     wanted = _read_values(existing(file, "a YAML file of parameters"))
-    found = running_graph(graph, wait)
+    found = which.found()
     for operator in wanted:
         _split(operator, _graph(found))
     _check(timeout)
@@ -261,14 +256,12 @@ def _value(text: str, shown: str = "") -> Any:
     return value
 
 
-def _asked(
-    word: str | None, name: str | None, wait: float, timeout: float
-) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
+def _asked(word: str | None, which: Running, timeout: float) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
     """The operators that were asked, the parameter (or none), and what they answered."""
     from dataflow.client.processes import processes_of
 
     _check(timeout)
-    found = running_graph(name, wait)
+    found = which.found()
     graph = _graph(found)
     operator, parameter = ("", "") if word is None else _split(word, graph)
     operators = [operator] if operator else list(graph.nodes)

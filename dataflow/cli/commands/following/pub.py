@@ -12,7 +12,7 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.commands.following.param import Timeout, _check, _value
 from dataflow.cli.support.arguments import number
 from dataflow.cli.support.options import argument, option
@@ -34,8 +34,7 @@ def pub(
         float | None, option("--rate HZ", "Again and again.", parser=number(0.001, 1000, "messages a second"))
     ] = None,
     stamp: Annotated[int | None, option("--stamp NS", "Its timestamp. Default: the graph's event time of now.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Annotated[bool, option("--json", "One JSON object a message.")] = False,
 ) -> None:
@@ -63,7 +62,7 @@ def pub(
         raise fail("--stamp is that of one message; leave --rate and --count out")
     if stamp is not None and not 0 < stamp < 2**63:
         raise fail(f"--stamp {stamp}: expected nanoseconds, above 0")
-    found = running_graph(graph, wait)
+    found = which.found()
     with processes_of(found) as processes:
         taker = _taker(processes, operator, [*graph_of(found).nodes], len(found.endpoints), timeout)
         kind = types_of(graph_of(found))(taker.types[0])

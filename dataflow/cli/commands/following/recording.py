@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Streams, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import THE_ONLY, Running, Streams, say_followed
 from dataflow.cli.support.arguments import Json, Overwrite, chosen_streams
 from dataflow.cli.support.material import Compression
 from dataflow.cli.support.options import argument, option
@@ -35,8 +35,7 @@ def record(
     readable: Readable = "owner",
     compression: Compression = "zstd",
     duration: Annotated[float | None, option("--seconds SECONDS", "Stop after so long.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     overwrite: Overwrite = False,
     quiet: Annotated[bool, option("--quiet -q", "Show no progress.")] = False,
     json: Json = False,
@@ -69,7 +68,7 @@ def record(
     if duration is not None and not 0 < duration < 1e9:
         raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
     output = recording_file(named(output), splitting, overwrite=overwrite, option="--out")
-    found = running_graph(graph, wait)
+    found = which.found()
     if not quiet:
         say_followed(found)
     running = graph_of(found)
@@ -143,8 +142,7 @@ def _report(tally: Tally, *, json: bool) -> None:
 
 def trigger(
     text: Annotated[str, argument("TEXT", "Why; it goes into the recording.")] = "asked for",
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Save the flight recorder's history.
@@ -166,7 +164,7 @@ def trigger(
     from dataflow.client.attach import graph_of
     from dataflow.client.trigger import trigger as ask
 
-    found = running_graph(graph, wait)
+    found = which.found()
     ask(found, text)
     flight = graph_of(found).record.flight
     assert flight is not None

@@ -8,7 +8,7 @@ from typing import Annotated
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json, find_modules_in
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import DIFFERENT, fail, out, print_json, say
@@ -16,8 +16,7 @@ from dataflow.cli.support.output import DIFFERENT, fail, out, print_json, say
 
 def reload(
     operator: Annotated[str, argument("OPERATOR", "Its name in the graph, such as detector.")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     timeout: Annotated[float, option("--timeout SECONDS", "Wait so long for an answer.", min=0.1)] = 90.0,
     json: Json = False,
 ) -> None:
@@ -41,7 +40,7 @@ def reload(
     from dataflow.client.processes import NoAnswer, Refused, processes_of
     from dataflow.graph.problems import did_you_mean
 
-    found = running_graph(graph, wait)
+    found = which.found()
     nodes = graph_of(found).nodes
     if operator not in nodes:
         raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, nodes, 'there are')}")
@@ -61,8 +60,8 @@ def reload(
         print_json({"operator": operator, **outcome})
     else:
         where = f" on machine {machine}, to which no code is sent" if machine else ""
-        which = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
-        text = f"{operator} goes on with {which} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
+        code = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
+        text = f"{operator} goes on with {code} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
         out.print(Text(text), soft_wrap=True)
 
 

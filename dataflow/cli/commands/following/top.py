@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.options import option
 from dataflow.cli.support.output import INTERRUPTED, err, fail, out, print_json
 
@@ -29,8 +29,7 @@ FIRST_AFTER = 0.1
 def top(
     once: Annotated[bool, option("--once", "Print one table and end.")] = False,
     every: Annotated[float, option("--every SECONDS", "Time between two updates.")] = 1.0,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Annotated[bool, option("--json", "Print one sample as JSON and end.")] = False,
 ) -> None:
     """Show the status of every operator of a running graph, and the latency of every path through it.
@@ -59,7 +58,7 @@ def top(
 
     if not 0.05 <= every < 1e6:
         raise fail(f"--every {every:g}: expected seconds, 0.05 or more")
-    found = followed_graph(graph, wait)
+    found = which.followed()
     with processes_of(found) as processes:
         processes.connected(len(found.endpoints), CONNECT_WITHIN)
         try:
