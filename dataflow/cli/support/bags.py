@@ -16,6 +16,7 @@ from dataflow.cli.support.output import (
     DIFFERENT,
     count,
     counting,
+    facts_table,
     fail,
     out,
     plural,
@@ -144,9 +145,7 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
         facts |= {"attachments": attached, "metadata": [{"name": name, "values": values} for name, values in records]}
         print_json(facts | {"topics": [row.as_json() for row in rows]} | whole.as_json())
         return
-    grid = table("", "")
-    grid.box, grid.show_header = None, False
-    for name, value in (
+    about = (
         ("file", str(path)),
         ("format", kind),
         ("size", size(_bytes(path))),
@@ -156,9 +155,8 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
         ("messages", count(whole.messages)),
         *((("attachments", count(attached)),) if attached else ()),
         *((("metadata", f"{', '.join(name for name, _ in records)} (--metadata prints it)"),) if records else ()),
-    ):
-        grid.add_row(Text(name, style="dim"), Text(value))
-    out.print(grid)
+    )
+    out.print(facts_table((name, value, "") for name, value in about))
     numbers = ("messages", "Hz")
     made = table("topic", "type", *numbers, "read as", "", right=numbers)
     for row in rows:

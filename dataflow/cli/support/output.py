@@ -236,6 +236,19 @@ def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) 
     return made
 
 
+def facts_table(rows: Iterable[tuple[str, str, str]], title: str | None = None) -> Table:
+    """Names and values, each with its style, in two columns; names are whole where there is no title."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2))
+    grid.title, grid.title_justify, grid.title_style = title, "left", "bold"
+    grid.add_column(style="dim", no_wrap=title is None, overflow="fold")
+    grid.add_column(overflow="fold")
+    for name, value, style in rows:
+        grid.add_row(Text(name), Text(visible(value), style=style))
+    return grid
+
+
 def _one_line(cell: RenderableType | None) -> RenderableType | None:
     if isinstance(cell, str):
         return visible(cell)
