@@ -315,17 +315,6 @@ def test_the_types_of_messages_are_listed_and_described(dataflow) -> None:
     assert "there is no message type 'Odo'; there are Odometry" in dataflow("messages", "Odo", code=2).stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--to", "mcap", "--depth", "/depth=mm"), "expected units a metre, such as 1000"),
-        (("--to", "ros2", "--depth", "/depth"), "--depth has no effect on ros2"),
-    ],
-)
-def test_a_unit_of_depth_that_cannot_be_used_is_refused(dataflow, drive: Path, tmp_path: Path, words, told) -> None:
-    assert told in dataflow("convert", drive, tmp_path / "o.mcap", *words, code=2).stderr
-
-
 def test_depth_of_a_recording_is_in_metres(dataflow, drive: Path, tmp_path: Path) -> None:
     dataflow("convert", drive, tmp_path / "own.mcap", "--to", "mcap")
 

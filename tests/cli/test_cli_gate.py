@@ -235,26 +235,6 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
     assert "graph 'gated' holds nothing to verify: all its operators (left) are sources or external" in told
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--accept"], "name the file with --baseline"),
-        (["--accept", "--baseline", "b.json", "--only", "one"], "leave --from and --only out"),
-        (["--baseline", "b.yaml"], "ends in .json"),
-        (["--junit", "v.txt"], "ends in .xml"),
-        (["--tolerance", "-1"], "0 or more"),
-        (["--jobs", "0"], "--jobs 0: expected 1 to"),
-        (["--start", "1", "--baseline", "b.json"], "--start and --baseline exclude each other"),
-        (["--start", "nan"], "--start nan: expected seconds"),
-        (["--start", "inf"], "--start inf: expected seconds"),
-        (["--start", "-1"], "--start -1: expected seconds"),
-        (["absent.mcap"], "absent.mcap"),
-    ],
-)
-def test_wrong_options_of_the_gate_are_refused(dataflow, folder: Path, words: list[str], message: str) -> None:
-    assert message in gate(dataflow, folder, *words, code=2).stderr
-
-
 @pytest.mark.long
 def test_a_thin_recording_is_completed_and_is_then_verified(dataflow, folder: Path, tmp_path: Path) -> None:
     same = folder / "same.yaml"

@@ -97,39 +97,6 @@ def test_unchanged_recording_verifies_as_identical(dataflow, recorded) -> None:
     told = dataflow("verify", path, "--jobs", "1", "--json", "-q")
 
     assert json.loads(told.stdout)["identical"] is True
-    assert "exclude each other" in dataflow("verify", path, "--from", "smooth", "--only", "sum", code=2).stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--record", "{recording}"], "replace it with --overwrite"),
-        (["--record", "{graph}", "--overwrite"], "ends in .mcap"),
-        (["--record", "{folder}.mcap"], "is a folder"),
-        (["--view", "window"], "expected spawn, serve, or a file name that ends in .rrd"),
-        (["--view", "spawn"], "there is no display"),
-        (["--open"], "needs --view FILE.rrd"),
-        (["--open", "--view", "serve"], "needs --view FILE.rrd"),
-        (["--rate", "1e-300"], "from 0.001 to 1,000"),
-        (["--rate", "nan"], "from 0.001 to 1,000"),
-        (["--rate", "-1"], "from 0.001 to 1,000"),
-        (["--timeout", "0"], "from 0.1 to 1,000,000"),
-        (["--one-process", "--process-each"], "exclude each other"),
-        (["--place", "nobody=a"], "left, smooth, gripper, sum"),
-        (["--set", "cuont=3"], "did you mean 'count'?"),
-        (["--set", "smooth.sleep=soon"], "sleep"),
-    ],
-)
-def test_wrong_options_are_refused_before_anything_runs(
-    dataflow, small: Path, recorded, tmp_path: Path, words: list[str], message: str
-) -> None:
-    (tmp_path / "folder.mcap").mkdir()
-    places = {"{recording}": recorded[0], "{graph}": small, "{folder}.mcap": tmp_path / "folder.mcap"}
-
-    told = dataflow("run", small, *(places.get(word, word) for word in words), code=2)
-
-    assert message in told.stderr
-    assert told.stdout == ""
 
 
 @pytest.mark.parametrize(
@@ -166,19 +133,6 @@ def test_a_replay_onto_itself_is_refused_under_any_name(dataflow, recorded, tmp_
         told = dataflow("replay", path, "--record", name, "--overwrite", code=2)
         assert "is the recording that is being replayed" in told.stderr
     assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--start", "9"], "ends 0.29 s after its first message"),
-        (["--start", "-1"], "0 or more"),
-        (["--start", "0.2", "--end", "0.1"], "must be greater"),
-        (["--set", "count=3"], "name it with --graph"),
-    ],
-)
-def test_a_replay_of_nothing_is_refused(dataflow, recorded, words: list[str], message: str) -> None:
-    assert message in dataflow("replay", recorded[0], *words, code=2).stderr
 
 
 def test_files_that_are_no_recordings_are_refused_with_the_reason(dataflow, small: Path, data_dir: Path) -> None:
@@ -369,8 +323,3 @@ def test_a_viewer_that_fails_does_not_end_the_run(dataflow, small: Path, tmp_pat
 
     assert "viewer: error: the Rerun program is missing" in told.stderr
     assert "small  complete" in told.stdout
-
-
-def test_a_live_run_cannot_begin_paused(dataflow, small: Path) -> None:
-    told = dataflow("run", small, "--live", "--step", code=2).stderr
-    assert "a live run cannot wait" in " ".join(told.split())

@@ -289,31 +289,6 @@ def test_recordings_of_a_store_are_fetched(dataflow, folder: Path, tmp_path: Pat
     assert {row["recording"] for row in rows(tmp_path)} == {"first.mcap", "deep/second.mcap"}
 
 
-@pytest.mark.parametrize(
-    ("words", "what"),
-    [
-        (("--what", "guess"), "expected replay, verify or evaluate"),
-        (("--jobs", "0"), "expected 1 to"),
-        (("--set", "scaled.by"), "expected NAME=VALUE"),
-        (("--set", "scaled.bye=1"), "bye"),
-        (("--recordings", "nowhere"), "no file or folder nowhere"),
-        (("--recordings", "file:///nowhere/at/all"), "no file or folder file:///nowhere/at/all"),
-    ],
-)
-def test_what_cannot_be_swept_is_refused_before_anything_runs(
-    dataflow, folder: Path, tmp_path: Path, words: tuple[str, ...], what: str
-) -> None:
-    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path)
-    assert what in dataflow("sweep", folder / "graph.yaml", *given, *words, code=2).stderr
-    assert not (tmp_path / "sweep.parquet").exists()
-
-
-def test_settings_that_cannot_be_compared_are_refused(dataflow, folder: Path, tmp_path: Path) -> None:
-    given = ("--recordings", folder / "runs", "--path", folder, "--out", tmp_path)
-    for word, what in (("scaled.by", "expected NAME=VALUE"), ("scaled.by=3", "A and B are the same")):
-        assert what in dataflow("compare", folder / "graph.yaml", *given, "--set", word, code=2).stderr
-
-
 @pytest.mark.long
 def test_two_settings_are_compared_pair_by_pair(dataflow, folder: Path, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
