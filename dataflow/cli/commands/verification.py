@@ -133,11 +133,11 @@ def verify(
     options.check()
     _check_files(recordings, options.junit, options.baseline)
     with early_workers(options.jobs) as early:  # while this process imports what it needs itself
-        from dataflow.verification.gate import recordings_in
+        from dataflow.verification import gate
 
-        known = None if options.baseline is None else Baseline.load(options.baseline)
+        known = None if options.baseline is None else gate.Baseline.load(options.baseline)
         graph = options.code.load()
-        found = recordings_in(recordings)
+        found = gate.recordings_in(recordings)
         single = len(recordings) == 1 and recordings[0] == found[0][0]
         checked = _check(found, known, graph, early, options, single=single)
         reasons = [_reasons(c, options.only, graph, quiet=options.quiet) for c in checked] if options.why else []
