@@ -84,7 +84,7 @@ def info(
 
 
 def _facts(described: Description) -> Iterator[tuple[str, str, str]]:
-    """What is known of a recording as a whole: names, values, styles."""
+    """Yields name, value and style of each fact about a whole recording."""
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.recording.mcap.attachments import tells_of_run
     from dataflow.recording.streams.cutting import cut_of, triggers_of

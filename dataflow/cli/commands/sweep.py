@@ -32,7 +32,7 @@ Recordings = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class WorkOptions:
-    """How recordings are replayed, and where the results are kept."""
+    """Options of the runs over recordings, and of the folder of their results."""
 
     maps: Map = None
     path: ModuleFolders = None

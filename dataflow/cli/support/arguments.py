@@ -97,7 +97,7 @@ Without = Annotated[list[str] | None, option("--without STREAM", "Leave these st
 
 @dataclass(frozen=True, slots=True)
 class BagOptions:
-    """How the topics of a bag are played."""
+    """Options of a bag: its topics, clock and faults."""
 
     maps: Map = None
     clock: Clock = "auto"
@@ -106,7 +106,7 @@ class BagOptions:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which messages are taken: streams, a span, and the clock of a bag."""
+    """Selection of messages: streams, a span, and the clock of a bag."""
 
     streams: Streams = None
     without: Without = None

@@ -58,7 +58,7 @@ Quiet = Annotated[bool, option("--quiet -q", "No progress display.")]
 
 @dataclass(frozen=True, slots=True)
 class PlacementOptions:
-    """Which processes run the operators."""
+    """Placement of operators in processes."""
 
     one_process: Annotated[bool, option("--one-process", "Run all operators in one process.", PLACEMENT)] = False
     process_each: Annotated[bool, option("--process-each", "Run every operator in a separate process.", PLACEMENT)] = (
@@ -105,7 +105,7 @@ class ViewOptions:
 
 @dataclass(frozen=True, slots=True)
 class ReportOptions:
-    """What a run prints."""
+    """Output of a run on the terminal."""
 
     quiet: Quiet = False
     verbose: Verbose = False

@@ -69,7 +69,7 @@ class RecordOptions:
     readable: Readable = "owner"
 
     def storage(self, *, flight: bool = False) -> Storage:
-        """How the recording is stored; ends the command where nothing is recorded. `flight`: a flight recorder does."""
+        """Storage of the recording; ends the command where nothing is recorded. `flight`: a flight recorder does."""
         from dataflow.recording.parts import Storage
 
         whole = {"--split-every": self.split_every, "--split-size": self.split_size, "--keep-disk": self.keep_disk}
