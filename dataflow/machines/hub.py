@@ -97,11 +97,7 @@ class Hub:
     """Runs the link until it is told to leave."""
 
     def __init__(
-        self,
-        config: HubConfig,
-        channel: Channel,
-        inbox: Inbox,
-        outgoing: Sequence[tuple[Sequence[str], Outgoing]],
+        self, config: HubConfig, channel: Channel, inbox: Inbox, outgoing: Sequence[tuple[Sequence[str], Outgoing]]
     ) -> None:
         self.config, self._channel, self._inbox = config, channel, inbox
         self._fanout = Fanout(outgoing, pool_bytes=POOL_BYTES)

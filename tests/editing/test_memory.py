@@ -76,11 +76,7 @@ def latency(number: int, _: Path, graph: Graph) -> int:
 
 @pytest.mark.parametrize(("work", "share"), [(cut, 4), (joined, 1), (latency, 1)], ids=["cut", "merge", "latency"])
 def test_memory_hardly_grows_with_the_length_of_a_run(
-    work: Callable[[int, Path, Graph], int],
-    share: int,
-    tmp_path: Path,
-    graph: Graph,
-    monkeypatch: pytest.MonkeyPatch,
+    work: Callable[[int, Path, Graph], int], share: int, tmp_path: Path, graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dataflow.analysis.latency.KEPT", 256)
     work(100, tmp_path, graph)  # what is loaded on the way

@@ -55,7 +55,7 @@ def test_a_replay_of_a_part_makes_what_the_whole_one_makes_there(stateful: Path,
     assert len(messages(again)["test/second/y"]) > 10
 
 
-def test_a_part_verifies_from_recorded_states_and_says_what_it_cannot(recorded: Path, tmp_path: Path) -> None:
+def test_part_verifies_from_recorded_states_and_reports_the_rest(recorded: Path, tmp_path: Path) -> None:
     report = verify(cut(recorded, tmp_path / "part.mcap", 0.5, 0.8))
 
     found = {v.operator: v for v in report.operators}

@@ -181,7 +181,7 @@ def test_streams_of_another_recording_join_a_run_that_still_verifies(stateful: P
     }
 
 
-def test_a_filtered_recording_says_what_it_cannot_verify(recorded: Path, tmp_path: Path) -> None:
+def test_filtered_recording_reports_unverifiable_operators(recorded: Path, tmp_path: Path) -> None:
     with Origin(recorded) as origin:
         names = [name for name in origin.counts() if not name.startswith("test/right/")]
         write_part(origin, Part(streams=names), tmp_path / "part.mcap")

@@ -33,9 +33,7 @@ def endpoint(tmp_path: Path) -> str:
     return f"unixsock-stream/{tmp_path / 'meet'}"
 
 
-def test_a_run_goes_on_while_its_machine_is_not_heard_until_it_is_lost(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_continues_while_machine_is_silent_until_lost(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with elsewhere(endpoint, None):
         with answering(endpoint, 1.0):
             found = find_running(None)
@@ -47,7 +45,7 @@ def test_a_run_goes_on_while_its_machine_is_not_heard_until_it_is_lost(
 
 
 @pytest.mark.parametrize("ends", ["another run", "its own end"])
-def test_a_run_is_over_when_its_machine_says_so_or_has_another(endpoint: str, ends: str) -> None:
+def test_run_is_over_when_machine_ends_it_or_has_another(endpoint: str, ends: str) -> None:
     with elsewhere(endpoint, None), ExitStack() as stack:
         with answering(endpoint, 1.0):
             found = find_running(None)

@@ -98,7 +98,7 @@ def test_a_file_that_was_not_offered_is_sent_to_no_machine(met: tuple[Orders, li
     assert orders.kinds("robot")["file"] == 0
 
 
-def test_a_machine_is_believed_about_its_own_processes_alone(met: tuple[Orders, list[events.Event], Says]) -> None:
+def test_machine_reports_only_its_own_processes(met: tuple[Orders, list[events.Event], Says]) -> None:
     _, fed, says = met
 
     says("robot", "died", "right", code=1)

@@ -12,37 +12,24 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, existing
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    count,
-    err,
-    fail,
-    out,
-    plural,
-    print_json,
-    say,
-    seconds,
-    size,
-    table,
-)
+from dataflow.cli.support.arguments import existing
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, count, err, fail, out, plural, print_json, say, seconds, size, table
 from dataflow.cli.support.quantities import parsed_duration, parsed_moment
 
 if TYPE_CHECKING:
     from dataflow.editing.report import Edited
     from dataflow.recording.streams.copying import Origin
 
-Material = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording, or any other MCAP file.")]
-Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="The file to write.")]
+Material = Annotated[Path, argument("RECORDING", "A recording, or any other MCAP file.")]
+Out = Annotated[Path, option("--out -o OUT.mcap", "The file to write.")]
 Compression = Annotated[
     Literal["zstd", "lz4", "none"],
-    typer.Option(
-        "--compression",
-        metavar="zstd|lz4|none",
-        help="How the file is compressed: zstd gives the smallest, lz4 takes less CPU time.",
+    option(
+        "--compression zstd|lz4|none", "How the file is compressed: zstd gives the smallest, lz4 takes less CPU time."
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")]
+Quiet = Annotated[bool, option("--quiet -q", "Show no progress.")]
 Word = str | None
 
 
