@@ -27,7 +27,7 @@ from dataflow.cli.support.arguments import (
     refuse_of_recording,
     window,
 )
-from dataflow.cli.support.material import Quiet
+from dataflow.cli.support.edited_files import Quiet
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import DIFFERENT, count, counting, fail, out, plural, print_json, say, shown, table
 

@@ -10,16 +10,16 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.support.arguments import Json, Overwrite, Without, chosen_streams, output_file
-from dataflow.cli.support.material import (
+from dataflow.cli.support.edited_files import (
     Compression,
-    Material,
+    EditedFile,
     Out,
     Quiet,
     Word,
     asked_span,
     copying,
     fail_if_lost,
-    opened_material,
+    opened_file,
     print_unknown,
     refuse_itself,
     tell_edited,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def cut(
-    recording: Material,
+    recording: EditedFile,
     output: Out,
     start: Annotated[Word, option("--from --start TIME", "Begin there. Default: at the beginning.")] = None,
     end: Annotated[Word, option("--to --end TIME", "End there. Default: at the end.")] = None,
@@ -69,7 +69,7 @@ def cut(
     """
     from dataflow.editing.part import Part, write_part
 
-    with opened_material(recording) as origin, copying("cutting", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("cutting", quiet or json) as watch:
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, [recording])
         part = asked_span(origin, start, end, duration)
@@ -80,7 +80,7 @@ def cut(
 
 
 def filter_(
-    recording: Material,
+    recording: EditedFile,
     output: Out,
     streams: Annotated[
         list[str] | None, option("--stream STREAM", "Keep these streams; wildcards work. May be repeated.")
@@ -110,7 +110,7 @@ def filter_(
     """
     from dataflow.editing.part import Part, write_part
 
-    with opened_material(recording) as origin, copying("filtering", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("filtering", quiet or json) as watch:
         if not streams and not without:
             raise fail("nothing to choose by: name streams with --stream, or with --without")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
@@ -122,7 +122,7 @@ def filter_(
 
 
 def split(
-    recording: Material,
+    recording: EditedFile,
     every: Annotated[Word, option("--every TIME", "Event time of a part: 60s, 5min, or a number of seconds.")] = None,
     nbytes: Annotated[Word, option("--size SIZE", "Size of a part, about: 500MB, 2GB, 100MiB.")] = None,
     folder: Annotated[
@@ -151,7 +151,7 @@ def split(
     """
     from dataflow.editing.split import split as parts_of
 
-    with opened_material(recording) as origin, copying("splitting", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("splitting", quiet or json) as watch:
         if (every is None) == (nbytes is None):
             raise fail("say how to split: --every TIME or --size SIZE")
         target = folder or recording.with_suffix("")

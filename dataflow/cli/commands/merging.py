@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.support.arguments import Json, Overwrite, existing, output_file
-from dataflow.cli.support.material import Compression, Out, Quiet, copying, opened_material, refuse_itself, tell_edited
+from dataflow.cli.support.edited_files import Compression, Out, Quiet, copying, opened_file, refuse_itself, tell_edited
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import count, fail, out, plural, print_json, say, shown, size, table
 
@@ -63,7 +63,7 @@ def merge(
         empty = [path for path in recordings if path.is_file() and not path.stat().st_size]
         recordings = [path for path in recordings if path not in empty]
         prefixes = _prefixes(prefix or (), recordings)
-        origins = [stack.enter_context(opened_material(path)) for path in recordings]
+        origins = [stack.enter_context(opened_file(path)) for path in recordings]
         watch = stack.enter_context(copying("merging", quiet or json))
         done = merge_all(origins, output, prefixes=prefixes, compression=compression, overwrite=overwrite, watch=watch)
         done.notes += [f"{path} {NOTHING_IN_IT}" for path in empty]

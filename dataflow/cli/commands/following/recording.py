@@ -14,7 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.commands.following.live import THE_ONLY, Running, Streams, say_followed
 from dataflow.cli.support.arguments import Json, Overwrite, chosen_streams
-from dataflow.cli.support.material import Compression
+from dataflow.cli.support.edited_files import Compression
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import count, err, fail, out, plural, print_json, say, seconds, size, table
 from dataflow.cli.support.storage import MODES, Readable, SplitEvery, SplitSize, named, recording_file, splitting_of

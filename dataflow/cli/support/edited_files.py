@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dataflow.editing.report import Edited
     from dataflow.recording.streams.copying import Origin
 
-Material = Annotated[Path, argument("RECORDING", "A recording, or any other MCAP file.")]
+EditedFile = Annotated[Path, argument("RECORDING", "A recording, or any other MCAP file.")]
 Out = Annotated[Path, option("--out -o OUT.mcap", "The file to write.")]
 Compression = Annotated[
     Literal["zstd", "lz4", "none"],
@@ -34,7 +34,7 @@ Word = str | None
 
 
 @contextmanager
-def opened_material(path: Path) -> Iterator[Origin]:
+def opened_file(path: Path) -> Iterator[Origin]:
     """An MCAP file, another program's as far as it can be read; other bags are answered with what makes one of them."""
     from dataflow.interop.opening import is_foreign
     from dataflow.recording.mcap.ending import MAGIC
