@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.messages import Boxes3D, Diagnostics, Planes, PointCloud, Pose
+from dataflow.messages import Boxes3D, Planes, PointCloud, Pose
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play
 from operators.cloud import PlaneSegmenter
@@ -70,9 +70,6 @@ def segmented(given: PointCloud, T: np.ndarray | None = None, **params: Any) -> 
     streams: dict[str, Any] = {"cloud": [given]} | ({} if T is None else {"pose": [pose(T)]})
     played = play(PlaneSegmenter(**params), streams)
     (planes,), (surfaces,), (rest,) = played["planes"], played["surfaces"], played["rest"]
-    assert isinstance(planes, Planes)
-    assert isinstance(surfaces, Boxes3D)
-    assert isinstance(rest, PointCloud)
     return planes, surfaces, rest
 
 
@@ -185,7 +182,6 @@ def test_the_floor_is_remembered_where_only_a_table_is_seen() -> None:
     clouds = [cloud(room(), T, 1), cloud(room(floor=False), T, 2)]
     played = play(PlaneSegmenter(), {"cloud": clouds, "pose": [pose(T, 1), pose(T, 2)]})
     _, second = played["surfaces"]
-    assert isinstance(second, Boxes3D)
     assert sorted(second.labels()) == ["table", "wall", "wall"]
 
 
@@ -196,9 +192,6 @@ def test_a_cloud_too_small_for_planes_is_a_warning(points: np.ndarray) -> None:
     given = PointCloud(stamp=1, frame="camera", points=points.astype(np.float32))
     played = play(PlaneSegmenter(), {"cloud": [given]})
     (status,), (planes,), (rest,) = played["status"], played["planes"], played["rest"]
-    assert isinstance(status, Diagnostics)
-    assert isinstance(planes, Planes)
-    assert isinstance(rest, PointCloud)
     assert status.levels.tolist() == [1]
     assert "no plane in the cloud" in status.messages[0]
     assert planes.count == 0

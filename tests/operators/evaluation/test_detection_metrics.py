@@ -124,7 +124,7 @@ def test_classes_are_matched_by_name_and_unknown_ones_are_named() -> None:
 
 def test_boxes_of_a_larger_version_of_the_image_are_scaled() -> None:
     large = tuple(2 * v for v in A)
-    figures = score([found([("mug", large, 0.9)], width=400, height=200)], [true([("mug", A, 1.0)])])  # type: ignore[list-item]
+    figures = score([found([("mug", large, 0.9)], width=400, height=200)], [true([("mug", A, 1.0)])])
     assert figures["ap50_95"] == pytest.approx(1)
 
 

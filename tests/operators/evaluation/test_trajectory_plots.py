@@ -57,22 +57,22 @@ def played(estimate: list[Any], truth: list[Any], **params: Any) -> tuple[Played
 
 def test_errors_are_those_of_the_poses() -> None:
     made, operator = played(poses(off=0.3), poses())
-    assert [n.value for n in made["error"]] == pytest.approx([0.3] * 40)  # type: ignore[attr-defined]
-    assert [n.value for n in made["turn"]] == pytest.approx([0.0] * 40)  # type: ignore[attr-defined]
-    assert [n.value for n in made["nees"]] == pytest.approx([9.0 / 6] * 40)  # type: ignore[attr-defined]
+    assert [n.value for n in made["error"]] == pytest.approx([0.3] * 40)
+    assert [n.value for n in made["turn"]] == pytest.approx([0.0] * 40)
+    assert [n.value for n in made["nees"]] == pytest.approx([9.0 / 6] * 40)
     assert operator.summary() == {"compared": 40, "without truth": 0}
     assert dict(operator._nis)["gnss/fix"] == [(1.0, 1.0), (2.0, 1.0), (3.0, 4.0), (4.0, 4.0)]
 
 
 def test_a_first_pose_moved_onto_its_truth_leaves_what_changes() -> None:
     made, _ = played(poses(off=0.3), poses(), alignment="origin")
-    assert max(n.value for n in made["error"]) < 1e-9  # type: ignore[attr-defined]
+    assert max(n.value for n in made["error"]) < 1e-9
 
 
 def test_a_picture_comes_every_period_and_the_file_holds_everything(tmp_path: Path) -> None:
     made, _ = played(poses(off=0.3), poses(), out=str(tmp_path / "new"), period="1300ms")
     assert [p.stamp for p in made["picture"]] == [14 * STEP, 27 * STEP, 40 * STEP]
-    last = made["picture"][-1].data  # type: ignore[attr-defined]
+    last = made["picture"][-1].data
     assert last.shape == (800, 1440, 3)
     written = cv2.imread(str(tmp_path / "new" / "plots.png"), cv2.IMREAD_COLOR_RGB)
     np.testing.assert_array_equal(written, last)

@@ -213,7 +213,7 @@ def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
     def fed(check: MotionCheck, stamp: int) -> list[bytes]:
         now = by_stamp[stamp]
         motions = {f"robot/motions/{name}": m for name, m in now.items() if name != "wheels"}
-        made = check.process(SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics())  # type: ignore[arg-type]
+        made = check.process(SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics())
         return [made[name].digest() for name in sorted(made)]
 
     stamps = sorted(by_stamp)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Boxes3D, Diagnostics, Pose, Tracks, TrackState
+from dataflow.messages import Boxes3D, Pose, Tracks, TrackState
 from dataflow.messages.geometry import quaternion_from_yaw, quaternion_to_matrix, yaw_of
 from dataflow.testing import play
 from operators.tracking import MultiObjectTracker3D
@@ -48,21 +48,16 @@ def test_place_velocity_and_extent_are_those_of_a_noisy_walk() -> None:
         for k in range(40)
     ]
     last = tracked(given)[-1]
-    assert last.positions is not None
-    assert last.velocities is not None
-    assert last.covariances is not None
     assert ids(last) == [1]
     error = np.concatenate([last.positions[0] - ([1, 2, 0.85] + velocity * 3.9), last.velocities[0] - velocity])
     np.testing.assert_allclose(error, 0, atol=0.25)
     assert error @ np.linalg.solve(last.covariances[0], error) < 20
-    assert last.sizes is not None
     np.testing.assert_allclose(last.sizes[0], [0.6, 0.4, 1.7], atol=1e-6)
 
 
 def test_a_walker_faces_its_way_though_boxes_leave_half_a_turn_open() -> None:
     given = [boxes(k, [0.1 * k, 0, 0.85], np.pi if k % 2 else 0.0) for k in range(20)]
     last = tracked(given)[-1]
-    assert last.orientations is not None
     assert float(yaw_of(last.orientations)[0]) == pytest.approx(0, abs=0.05)
 
 
@@ -76,7 +71,6 @@ def test_ids_outlast_a_crossing_with_one_of_the_two_hidden() -> None:
     messages = tracked(given)
     assert ids(messages[25], TrackState.COASTING) == [2]
     assert ids(messages[-1]) == [1, 2]
-    assert messages[-1].positions is not None
     assert messages[-1].positions[0, 0] > 4 > 1 > messages[-1].positions[1, 0]
 
 
@@ -88,9 +82,6 @@ def test_a_pose_puts_boxes_of_a_tilted_sensor_upright() -> None:
     np.testing.assert_allclose(quaternion_to_matrix(q), R, atol=1e-12)
     poses = [Pose(stamp=m.stamp, frame="map", child_frame="world", position=[1, 0, 0], orientation=q) for m in given]
     last = play(MultiObjectTracker3D(), {"boxes": given, "pose": poses})["tracks"][-1]
-    assert isinstance(last, Tracks)
-    assert last.positions is not None
-    assert last.sizes is not None
     assert last.frame == "map"
     np.testing.assert_allclose(last.positions[0], [3.0, 0.3, 0.9], atol=1e-9)
     np.testing.assert_allclose(last.sizes[0], [0.6, 0.4, 1.7], atol=1e-9)
@@ -99,7 +90,6 @@ def test_a_pose_puts_boxes_of_a_tilted_sensor_upright() -> None:
 def test_unusable_boxes_are_counted_and_another_frame_is_refused() -> None:
     played = play(MultiObjectTracker3D(), {"boxes": [boxes(0, [[np.nan, 0, 0], [1, 0, 0]])]})
     status = played["status"][0]
-    assert isinstance(status, Diagnostics)
     assert status.pairs(0)["unusable boxes"] == "1"
     poses = [Pose(stamp=2 * FRAME, frame="map", child_frame="world", position=[0, 0, 0], orientation=[0, 0, 0, 1])]
     with pytest.raises(OperatorFailure, match="boxes are in map, those before were in world"):

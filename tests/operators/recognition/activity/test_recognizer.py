@@ -76,15 +76,12 @@ def test_who_lowers_onto_a_chair_sits_down_and_then_sits_on_it() -> None:
     assert found[9] == "standing"
     assert "sitting_down" in found[13:19]
     assert set(found[24:]) == {"sitting"}
-    assert messages[-1].objects is not None
     assert messages[-1].objects.tolist() == [5]
-    assert messages[-1].since is not None
     assert 3.0 <= messages[-1].since[0] * 1e-9 <= 6.0
 
 
 def test_the_probabilities_of_each_agent_sum_to_one() -> None:
     for message in play(Recognizer(), {"nodes": course(2, lambda t: [person(0.2 * t, 0.0)])})["activities"]:
-        assert message.probabilities is not None
         assert message.probabilities.sum() == pytest.approx(1, abs=1e-4)
 
 
@@ -216,7 +213,6 @@ def test_an_agent_that_was_lost_begins_anew_and_nobody_is_no_error() -> None:
     graphs = [nodes(0.0, [person(0, 0)]), nodes(0.25, []), nodes(0.5, [person(5, 5)])]
     messages = play(Recognizer(), {"nodes": graphs})["activities"]
     assert [m.count for m in messages] == [1, 0, 1]
-    assert messages[2].since is not None
     assert messages[2].since.tolist() == [500_000_000]
 
 

@@ -24,7 +24,6 @@ def body(parts: Sequence[NDArray[np.float64]], lowest: float, highest: float) ->
     groups = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
     inner = (points[:, 2] >= lowest) & (points[:, 2] <= highest)
     found = body_of(points, inner, groups, UP)
-    assert found is not None
     return points[found[0]], found[1]
 
 

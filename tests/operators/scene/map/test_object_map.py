@@ -109,7 +109,6 @@ def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: floa
         low, high = -0.4, 0.4 if cut else 1.0
         person: Solid = ((2.0, y, (low + high) / 2), (0.5, 0.5, high - low))
         seen = observation(person, BOX, T)
-        assert seen.image is not None
         edges = np.array([True, not cut, True, True])
         seen = replace(seen, image=replace(seen.image, edges=edges))
         known.update((k + 1) * SECOND // 4, [seen], RangeView(np.zeros((0, 3)), T, 0.012))

@@ -154,9 +154,7 @@ def step(known: SemanticMap, stamp: int, given: Boxes3D | None) -> SceneGraph:
     labels = np.full(len(points), -1, np.int32)
     clusters = Clusters(stamp=stamp, frame="camera", labels=labels, centroids=none)
     pose = Pose(stamp=stamp, frame="map", child_frame="camera", position=[0, 0, 1], orientation=[0, 0, 0, 1])
-    nodes = known.process(boxes, clusters, cloud, pose, surfaces=given)["nodes"]
-    assert isinstance(nodes, SceneGraph)
-    return nodes
+    return known.process(boxes, clusters, cloud, pose, surfaces=given)["nodes"]
 
 
 def at(x: float, y: float, z: float) -> Array:
@@ -181,7 +179,6 @@ def test_the_map_has_surfaces_as_nodes_beside_its_objects() -> None:
     assert list(zip(nodes.ids.tolist(), named, strict=True)) == [(0, "floor"), (-12, "tabletop")]
     assert np.allclose(nodes.positions[:, 2], [0, 0.7], atol=0.02)
     assert np.allclose(np.sort(nodes.sizes[1]), [0.02, 0.8, 1.2], atol=0.11)
-    assert nodes.last_seen is not None
     assert nodes.last_seen.tolist() == [2 * SECOND] * 2
     later = step(known, 3 * SECOND, None)
     assert later.ids.tolist() == nodes.ids.tolist()

@@ -80,7 +80,6 @@ def test_keyframes_move_the_poses_at_their_times_and_those_behind_them_as_the_la
         keyframes([2 * STEP, 5 * STEP // 2, 4 * STEP], [motion(2, 0, 0), motion(2.5, 0, 0), turned])
     )
 
-    assert correction is not None
     assert correction.stamps == [2 * STEP, 5 * STEP // 2, 4 * STEP]
     np.testing.assert_allclose(correction.motions[:2], np.stack([np.eye(4)] * 2), atol=1e-9)
     by = turned @ np.linalg.inv(motion(4, 0, 0))
@@ -97,7 +96,6 @@ def test_keyframes_that_agree_move_nothing_and_those_of_other_times_are_passed_o
 
     correction = trajectory.corrected(known)
 
-    assert correction is not None
     assert correction.stamps == [0, 9 * STEP]
     np.testing.assert_allclose(correction.motions, np.stack([np.eye(4)] * 2), atol=1e-9)
     assert Trajectory().corrected(known) is None
