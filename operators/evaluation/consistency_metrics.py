@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,11 +17,12 @@ from operators.evaluation.consistency import (
     normalised,
     pose_error,
 )
+from operators.evaluation.figures import Figures
 
 Array = NDArray[np.float64]
 
 
-class ConsistencyMetrics(Operator):
+class ConsistencyMetrics(Figures, Operator):
     """Collects poses with covariance and the true ones, and computes the normalised estimation error squared (NEES).
 
     An honest covariance gives a mean of the degrees of freedom and 5 % above the bound. `anees` over freedom is 1 then;
@@ -47,13 +46,13 @@ class ConsistencyMetrics(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
 
     def setup(self) -> None:
+        super().setup()
         self._stamps: list[int] = []
         self._estimates: list[tuple[Pose | Odometry, Array]] = []
         self._true_stamps: list[int] = []
         self._truths: list[Pose | Odometry] = []
         self._innovations: Innovations = {}
         self._passed_over = self._truths_not_finite = 0
-        self._figures: dict[str, float | int | str] = {}
 
     def process(
         self,
@@ -86,10 +85,6 @@ class ConsistencyMetrics(Operator):
         self._stamps.append(estimate.stamp)
         self._estimates.append((estimate, covariance))
 
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
-
     def finish(self) -> None:
         """Computes the figures."""
         pairs = mutually_nearest(self._stamps, self._true_stamps, self.tolerance)
@@ -110,9 +105,6 @@ class ConsistencyMetrics(Operator):
         for sensor, (total, freedom) in sorted(self._innovations.items()):
             if freedom:
                 self._judge(f"{sensor}, nis", f"{sensor}, nis_band_95_percent", total, freedom)
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
 
     def _score(self, name: str, axes: list[int], pairs: list[tuple[int, Array, Array]]) -> None:
         """Scores an estimate's axes by stamp, error (6,) and covariance (6, 6) of every pair."""

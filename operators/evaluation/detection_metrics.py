@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from dataflow.messages import Detections2D
 from dataflow.operator import Batch, Duration, In, Operator, Param
 from operators.evaluation.detection_score import ClassScore, DetectionScore, ScoredFrame, precision, recall
+from operators.evaluation.figures import Figures, check_names, check_view, listed
 from operators.evaluation.pairing import Pairing
-from operators.evaluation.views import check_names, check_view, listed
 
 
-class DetectionMetrics(Operator):
+class DetectionMetrics(Figures, Operator):
     """Collects detections and the true objects and computes COCO's AP50 and AP50:95 when the detections end.
 
     Frames are paired after the fact, each with the truth nearest in time within `tolerance`; frames without a partner
@@ -47,6 +47,7 @@ class DetectionMetrics(Operator):
     out: str | None = Param(None, doc="JSON file for the figures and a table of the classes; its folder is made")
 
     def setup(self) -> None:
+        super().setup()
         self._pairs: Pairing[Objects, Objects] = Pairing(self.tolerance)
         self._score = DetectionScore(
             max_detections=self.max_detections, iou=self.iou, score_threshold=self.score_threshold
@@ -54,7 +55,6 @@ class DetectionMetrics(Operator):
         self._known_to: int | None = None
         self._known: set[str] = set()
         self._classes: set[str] = set()
-        self._figures: dict[str, float | int | str] = {}
 
     def process(self, detections: Detections2D, truth: tuple[Detections2D, ...]) -> None:
         """Raises ValueError where detections and truth are of different cameras or views, or only one has names."""
@@ -70,10 +70,6 @@ class DetectionMetrics(Operator):
             self._known_to = truth[-1].stamp
         if self._known_to is not None:  # in a live run the truth may come late
             self._take(self._pairs.settle(min(self._known_to, detections.stamp)))
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Computes the figures and writes the file."""
@@ -93,9 +89,6 @@ class DetectionMetrics(Operator):
             self._figures["classes_not_in_truth"] = listed(set(beyond))
         if self.out is not None:
             self._write(Path(self.out).expanduser(), classes)
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
 
     def _ignored(self, truth: Detections2D) -> NDArray[np.bool_]:
         ignored = np.zeros(truth.count, np.bool_)

@@ -12,6 +12,7 @@ from dataflow.messages import Imu, Odometry, Pose, Transforms
 from dataflow.messages.geometry import matrix_to_quaternion, normalize, quaternion_from_yaw, quaternion_multiply
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
 from operators.association import mutually_nearest
+from operators.evaluation.figures import Figures
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
@@ -39,7 +40,7 @@ def errors(difference: Array) -> tuple[Array, Array, Array]:
     return total, 2 * np.arctan2(z, w), 2 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
 
 
-class OrientationMetrics(Operator):
+class OrientationMetrics(Figures, Operator):
     """Collects estimated and true orientations and computes the RMSE of the total error, of heading and of inclination.
 
     Each estimate is paired with the truth nearest in time within `tolerance`. A truth that poses another frame of the
@@ -60,11 +61,11 @@ class OrientationMetrics(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
 
     def setup(self) -> None:
+        super().setup()
         self._stamps: list[int] = []
         self._estimates: list[np.ndarray] = []
         self._true_stamps: list[int] = []
         self._truths: list[np.ndarray] = []
-        self._figures: dict[str, float | int | str] = {}
 
     def process(
         self,
@@ -89,10 +90,6 @@ class OrientationMetrics(Operator):
         if estimate.orientation is not None:
             self._stamps.append(estimate.stamp)
             self._estimates.append(estimate.orientation)
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Computes the figures, degrees."""

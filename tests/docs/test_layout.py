@@ -21,7 +21,6 @@ LONG = {
     "dataflow.cli.commands.replay:replay": 135,
     "dataflow.cli.commands.run:run": 103,
     "dataflow.cli.commands.verification:verify": 86,
-    "operators.scene.map.cuboid:fit_cuboid": 81,
 }
 """Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller.
 

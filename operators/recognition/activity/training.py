@@ -17,21 +17,21 @@ from operators.learning.balance import class_weights
 from operators.learning.export import export_steps
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import NAMES
+from operators.recognition.activity.model import KIND
 from operators.recognition.activity.samples import (
     LAG,
     Track,
     labels_of,
+    macro_f1,
     right_within,
     tracked_sequences,
     true_sequences,
 )
-from operators.recognition.activity.score import macro_f1
 from operators.recognition.activity.sensed_people import SensedTrack
 from operators.simulator.classes import ACTIVITIES
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 LAYERS = 2
-KIND = "activity"
 TOLERANCE = 0.5
 _STRIDES = (1, 2, 2, 3, 4)
 _UNSEEN = 0.15  # how much a moment out of sight counts

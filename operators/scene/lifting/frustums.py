@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from operators.cloud.clustering import level_axes, upright_box
+from operators.cloud.clustering import connected, level_axes, upright_box
 from operators.cloud.filtering import Voxels
 from operators.scene.lifting.body_points import beyond, body_of
 
@@ -401,9 +399,7 @@ def _linked(places: Array, reach: float) -> NDArray[np.intp]:
     """Returns the group of each place (N, 3): those within reach of each other, directly or by others, are one."""
     count = len(places)
     if count > _DENSE:
-        pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
-        graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
-        return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+        return connected(cKDTree(places).query_pairs(reach, output_type="ndarray"), count).astype(np.intp)
     square = np.einsum("ij,ij->i", places, places)
     linked = square[:, None] + square[None, :] - 2 * (places @ places.T) <= reach * reach
     linked.ravel()[:: count + 1] = True

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.box_images import image_boxes
-from operators.scene.map.cells import Cells, standing_box
-from operators.scene.map.cuboid import ImageView
+from operators.scene.map.cuboid import ImageView, image_boxes
 from operators.scene.map.map_object import MapObject
+from operators.scene.map.voxels import VoxelSet, standing_box
 from operators.tracking.assignment import overlap
 
 Array = NDArray[np.float64]
@@ -67,12 +66,12 @@ class Observation:
     track: int = -1
 
 
-def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, s: MapSettings) -> float:
+def alike_mover(each: Observation, voxels: VoxelSet, object: MapObject, stamp: int, s: MapSettings) -> float:
     """Returns how likely an observation is of a mover, by where that should be by now and its track; 0 for not."""
     if each.class_id != object.class_id:
         return 0.0
     since = (stamp - object.seen) * 1e-9
-    center, _, _ = standing_box(cells.points)
+    center, _, _ = standing_box(voxels.points)
     away = center - object.center - object.velocity * min(since, 1.0)
     reach = s.mover_reach + s.mover_speed * min(since, 2.0)
     near = 1 - float(np.hypot(away[0], away[1])) / reach
@@ -88,22 +87,22 @@ class InImage:
 
 
 def alike(
-    each: Observation, cells: Cells, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
+    each: Observation, voxels: VoxelSet, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
 ) -> float:
     """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
     `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
-    away = outside(cells.middle, object.box)
-    reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
+    away = outside(voxels.middle, object.box)
+    reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(voxels.middle - each.image.eye))
     if away > reach:
         return 0.0
     if each.class_id != object.class_id:
         if image is not None:
             return 0.5 * image.iou if image.iou >= 0.6 else 0.0
-        if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
+        if float(np.abs(object.size - voxels.extent).max()) > 0.5 * float(object.size.max()):
             return 0.0
-        share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
+        share = min(object.voxels.near(voxels.points, s.voxel), voxels.near(object.voxels.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
     value += _TRACKED if each.track in object.tracks else 0.0
@@ -111,18 +110,18 @@ def alike(
         return value + 0.6 * image.iou
     if image is not None and not large:  # what is hidden in part shows in part of its box
         return value + 0.2 * image.within if image.within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
-    share = object.cells.near(cells.points, tolerance(cells.extent))
+    share = object.voxels.near(voxels.points, tolerance(voxels.extent))
     if image is None and not large:
-        value *= closeness(cells, object.cells)
+        value *= closeness(voxels, object.voxels)
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
-def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
+def in_reach(seen: Sequence[Observation], voxels: Sequence[VoxelSet], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
     """Returns which of the observations (N) are near enough to boxes (M, 7), centre, size, heading, to be `alike`.
 
     A micrometre more passes: `alike` decides.
     """
-    middles = np.array([each.middle for each in cells])
+    middles = np.array([each.middle for each in voxels])
     eyes = [middle if each.image is None else each.image.eye for each, middle in zip(seen, middles, strict=True)]
     reach = s.reach + _SLACK * np.sqrt(np.square(middles - np.array(eyes)).sum(axis=1))
     x, y, z = middles.T[..., None] - rows.T[:3, None]
@@ -187,12 +186,12 @@ def tolerance(extent: Array) -> float:
     return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
 
 
-def closeness(cells: Cells, known: Cells) -> float:
+def closeness(voxels: VoxelSet, known: VoxelSet) -> float:
     """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
-    extent = np.sort(cells.extent)
+    extent = np.sort(voxels.extent)
     if extent[2] > 0.4:
         return 0.5
-    away = float(np.linalg.norm(cells.middle - known.middle))
+    away = float(np.linalg.norm(voxels.middle - known.middle))
     return max(0.0, 1 - away / (max(float(extent[1]), 0.03) + 0.02))
 
 

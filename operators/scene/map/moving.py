@@ -59,7 +59,7 @@ class RecentPlaces:
             each.moving = told if not each.moving >= 0 else (each.moving + told) / 2
         self._moments = [m for m in kept if before is None or m.stamp >= before.stamp]
         if movers and (not kept or stamp - kept[-1].stamp >= _EVERY * 1e9):
-            self._moments.append(_Moment(stamp, view, {o.id: o.cells.points for o in movers}))
+            self._moments.append(_Moment(stamp, view, {o.id: o.voxels.points for o in movers}))
 
     def forget(self) -> None:
         """Forgets the views: they are not where they were any more."""
@@ -80,7 +80,7 @@ def _moved(object: MapObject, before: _Moment, view: RangeView, margin: float) -
 
     0.5 where its places are hidden in the views, NaN where neither looks at them.
     """
-    sights = [before.view.of(object.cells.points, margin)]
+    sights = [before.view.of(object.voxels.points, margin)]
     if object.id in before.places:
         sights.append(view.of(before.places[object.id], margin))
     shares = [share for share in map(_seen_through, sights) if share is not None]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.map_object import MOST_EVIDENCE, WHOLE, MapObject
 from operators.scene.map.matching import MapSettings
 from operators.scene.map.range_view import GROWTH, RangeView, Sight
+from operators.scene.map.voxels import VoxelSet
 
 Array = NDArray[np.float64]
 
@@ -26,16 +26,16 @@ def has_left(object: MapObject, view: RangeView, s: MapSettings) -> bool:
     """
     away = float(np.linalg.norm(object.center - view.origin))
     margin = min(s.margin + GROWTH * away, _STRAY + _NOISES * s.range_noise * away * away)
-    return _is_empty(view.of(object.cells.points, margin, 0.0))
+    return _is_empty(view.of(object.voxels.points, margin, 0.0))
 
 
 def look_at(
     object: MapObject,
     sight: Sight | None,
     eye: Array,
-    own: Cells | None,
+    own: VoxelSet | None,
     seconds: float,
-    kinds: Kinds,
+    priors: ClassPriors,
     s: MapSettings,
     *,
     left: bool,
@@ -45,18 +45,18 @@ def look_at(
     `seconds` is the time since the view before: a view soon after it weighs less. `left` marks an object whose place a
     finer look found empty.
     """
-    mover = kinds.is_mover(object)
-    if not len(object.cells):
+    mover = priors.is_mover(object)
+    if not len(object.voxels):
         object.evidence = -1.0
         return
     if not mover and sight is not None:
         if own is not None and object.views % _SELDOM == 0:
-            object.cells.doubt(sight.confirmed, own, _SELDOM)
-        object.cells.carve(sight.free)
-        object.most = max(object.most, len(object.cells))
+            object.voxels.doubt(sight.confirmed, own, _SELDOM)
+        object.voxels.carve(sight.free)
+        object.most = max(object.most, len(object.voxels))
     if own is not None:
         return
-    if len(object.cells) < _LEFT * object.most:
+    if len(object.voxels) < _LEFT * object.most:
         object.evidence = -1.0
     if mover:
         object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory

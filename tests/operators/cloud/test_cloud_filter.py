@@ -56,6 +56,12 @@ def test_a_voxel_has_the_mean_of_its_points_and_of_what_is_known_of_them() -> No
     assert out.rings is None
 
 
+def test_chosen_points_of_an_organised_cloud_keep_their_precise_coordinates_and_no_rows() -> None:
+    points = np.array([[1.0, 0, 0], [9, 0, 0], [2, 0, 0], [3, 0, 0]])
+    out, _ = filtered(cloud(points, precise=points + 1e6, columns=2), max_range=5.0)
+    assert (out.columns, out.precise.tolist()) == (None, (points[[0, 2, 3]] + 1e6).tolist())
+
+
 @given(st.integers(0, 1000), st.floats(0.05, 2.0))
 def test_voxels_do_not_depend_on_the_order_of_the_points(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)

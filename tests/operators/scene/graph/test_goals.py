@@ -9,7 +9,7 @@ import pytest
 
 from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body
-from operators.scene.graph.goals import GoalInference
+from operators.scene.graph.agents import GoalInference
 from operators.scene.graph.layers import GraphSettings, LayeredGraph
 
 STEP = 250_000_000
@@ -25,15 +25,10 @@ def person(x: float, y: float) -> Body:
 
 
 def after(places: list[tuple[float, float]], goals: list[Body]) -> dict[int, float]:
-    inference, found = inferring(), {-1: 1.0}
+    inference, found = GoalInference(), {-1: 1.0}
     for k, (x, y) in enumerate(places):
         found = inference.update(0.25 * k, person(x, y), goals)
     return found
-
-
-def inferring() -> GoalInference:
-    s = GraphSettings()
-    return GoalInference(s.trust, s.memory, s.elsewhere)
 
 
 def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
@@ -56,7 +51,7 @@ def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
 def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
     """Doors left and right, equally far from who has come from the left: that to the left was left behind."""
     left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
-    inference, walk = inferring(), [0.2 * k for k in range(6)]
+    inference, walk = GoalInference(), [0.2 * k for k in range(6)]
     for k, x in enumerate(walk):
         late = inference.update(0.25 * k, person(x, 0.0), [right] if k < 5 else [left, right])
     early = after([(x, 0.0) for x in walk], [left, right])
@@ -90,7 +85,7 @@ def test_a_person_heads_for_what_it_walks_to_where_the_label_space_has_goals(
 
 def test_a_restored_inference_goes_on_the_same() -> None:
     goals = [thing(1, "door", 4, 0, size=1), thing(2, "chair", 0, 4, size=0.5)]
-    first, second = inferring(), inferring()
+    first, second = GoalInference(), GoalInference()
     for k in range(8):
         first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals)
     second.restore(first.snapshot())

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.labels import LabelSpace, labels_file
 from operators.scene.box_overlap import shared_volume, upright_iou
-from operators.scene.map.box_images import image_boxes, images
-from operators.scene.map.cells import standing_box
-from operators.scene.map.cuboid import Box, ImageView, _surface, fit_cuboid
+from operators.scene.map.cuboid import Box, ImageView, _surface, fit_cuboid, image_boxes, images
+from operators.scene.map.voxels import standing_box
 
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
 ALL = np.ones(4, np.bool_)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.labels import SizePrior
-from operators.scene.map.box_images import image_boxes
-from operators.scene.map.cuboid import ImageView
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
+from operators.scene.map.cuboid import ImageView, image_boxes
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.matching import MapSettings, Observation
 from operators.scene.map.merging import merge
@@ -51,7 +50,7 @@ def observation(solid: Solid, class_id: int, T: NDArray[np.float64]) -> Observat
 
 def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] = ()) -> ObjectMap:
     """The map after views of things, each said to be of a class and perhaps a track, a quarter of a second apart."""
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
+    known = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     for k, scene in enumerate(scenes):
         T = looking(0.4 * np.sin(k))
         wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
@@ -87,7 +86,7 @@ def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None
 @pytest.mark.parametrize(("bottom", "reaches_down"), [(0.7, True), (1.6, False)])
 def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reaches_down: bool) -> None:
     size = {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), foot=1.0),)}
-    known = ObjectMap(3, Kinds([BOX], size), MapSettings())
+    known = ObjectMap(3, ClassPriors([BOX], size), MapSettings())
     known.floor = -0.4
     T = looking(0.0)
     half: Solid = ((2.0, 0.0, bottom - 0.4 + 0.4), (0.5, 0.5, 0.8))
@@ -101,7 +100,7 @@ def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reach
 
 @pytest.mark.parametrize("along", [0.0, 0.4])
 def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: float) -> None:
-    known = ObjectMap(3, Kinds([BOX], {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2)),)}), MapSettings())
+    known = ObjectMap(3, ClassPriors([BOX], {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2)),)}), MapSettings())
     T = looking(0.0)
     for k in range(6):
         y = along * k / 5
@@ -145,7 +144,7 @@ def test_a_merged_object_has_the_tracks_of_both_and_the_last_ones_are_kept() -> 
     first, second = (after([[(THING, MUG)]] * 3, tracks=[track]).objects[1] for track in (5, 8))
     first.follow(range(10, 30))
     second.seen += 1
-    both = merge(first, second, Kinds([], {}))
+    both = merge(first, second, ClassPriors([], {}))
     assert both.tracks == [*range(15, 30), 8]
     assert MapObject.restored(both.snapshot(), 0.03).tracks == both.tracks
 
@@ -161,7 +160,7 @@ def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id
 
 def test_background_that_shows_through_a_small_thing_is_not_taken_for_a_large_one() -> None:
     small, large = SizePrior((0.12, 0.12, 0.2), (0.3, 0.3, 0.2)), SizePrior((0.4, 0.45, 0.9), (0.3, 0.3, 0.2))
-    known = ObjectMap(1, Kinds([], {BOX: (small, large)}), MapSettings())
+    known = ObjectMap(1, ClassPriors([], {BOX: (small, large)}), MapSettings())
     plant: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.2))
     for k in range(6):
         T = looking(0.4 * np.sin(k))
@@ -176,7 +175,9 @@ def carrying(*, portable: bool, lifted: int = 5) -> ObjectMap:
     """The map after a mug stood beside somebody, who then has it before the mouth."""
     body = SizePrior((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0)
     mug = SizePrior((0.1, 0.1, 0.1), (0.2, 0.2, 0.2), True)
-    known = ObjectMap(3, Kinds([BOX], {BOX: (body,), MUG: (mug,)}, [BOX], [MUG] if portable else []), MapSettings())
+    known = ObjectMap(
+        3, ClassPriors([BOX], {BOX: (body,), MUG: (mug,)}, [BOX], [MUG] if portable else []), MapSettings()
+    )
     somebody: Solid = ((2.0, 0.0, 0.4), (0.4, 0.5, 1.6))
     T = looking(0.0)
     wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
@@ -226,7 +227,7 @@ def test_how_high_somebody_is_over_the_floor_tells_how_deep() -> None:
     sitting = SizePrior((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, foot=1.0)
 
     def depth(top: float) -> float:
-        known = ObjectMap(1, Kinds([BOX], {BOX: (standing, sitting)}), MapSettings())
+        known = ObjectMap(1, ClassPriors([BOX], {BOX: (standing, sitting)}), MapSettings())
         known.floor = -0.4
         T = looking(0.0)
         trunk: Solid = ((2.0, 0.0, top - 0.35), (0.3, 0.5, 0.7))
@@ -240,7 +241,7 @@ def test_how_high_somebody_is_over_the_floor_tells_how_deep() -> None:
 def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
     beside: Solid = ((2.0, 0.13, 0.1), THING[1])
     known = after([[(THING, BOX), (beside, MUG)]] * 5)
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
+    again = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     again.restore(known.snapshot())
     assert [o.beside for o in again.objects.values()] == [o.beside for o in known.objects.values()]
     assert known.objects[1].beside[2] > 0
@@ -261,14 +262,14 @@ def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
     earlier = known.snapshot()
     for entry in earlier["objects"]:
         del entry["beside"]
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
+    again = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     again.restore(earlier)
     assert list(again.objects) == list(known.objects)
 
 
 @pytest.mark.parametrize("rate", [10, 20, 50])
 def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int) -> None:
-    known = ObjectMap(3, Kinds([], {}), MapSettings())
+    known = ObjectMap(3, ClassPriors([], {}), MapSettings())
     T, nothing = looking(0.0), RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
     for k in range(rate * 2 // 5 + 1):
         known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], nothing)
@@ -279,7 +280,7 @@ def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int
 
 @pytest.mark.parametrize(("seconds", "given"), [(0.1, 0), (0.3, 1)])
 def test_what_images_in_a_flash_show_is_not_yet_there(seconds: float, given: int) -> None:
-    known = ObjectMap(3, Kinds([], {}), MapSettings())
+    known = ObjectMap(3, ClassPriors([], {}), MapSettings())
     nothing = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
     for k in range(4):
         stamp = SECOND + round(k * seconds / 3 * SECOND)
@@ -293,7 +294,7 @@ def test_an_empty_place_is_given_up_as_soon_at_any_rate_of_images(rate: int) -> 
     T = looking(0.0)
     wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
     empty = RangeView((wall - T[:3, 3]) @ T[:3, :3], T, 0.012)
-    only(known).cells.hits[:] = 1000  # so that its voxels are not what goes first
+    only(known).voxels.hits[:] = 1000  # so that its voxels are not what goes first
     for k in range(1, 3 * rate + 1):
         known.update(2 * SECOND + k * SECOND // rate, [], empty)
         if not known.objects:
@@ -306,7 +307,7 @@ def test_a_snapshot_from_before_times_of_views_were_summed_is_taken_up() -> None
     earlier = known.snapshot()
     for entry in earlier["objects"]:
         del entry["told"]
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
+    again = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     again.restore(earlier)
     assert [o.sightings for o in again.objects.values()] == [5]
 
@@ -314,7 +315,7 @@ def test_a_snapshot_from_before_times_of_views_were_summed_is_taken_up() -> None
 @pytest.mark.parametrize(("length", "doubt"), [(0.14, 0.0), (0.8, 0.5)])
 def test_a_thing_larger_than_any_of_its_class_is_given_with_its_doubt(length: float, doubt: float) -> None:
     size = {BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}
-    known = ObjectMap(3, Kinds([], size), MapSettings())
+    known = ObjectMap(3, ClassPriors([], size), MapSettings())
     for k in range(6):
         eye = looking(0.2 * k)
         seen = [observation(((2.0, 0.0, 0.1), (0.12, length, 0.12)), BOX, eye)]
@@ -326,7 +327,7 @@ def test_a_thing_larger_than_any_of_its_class_is_given_with_its_doubt(length: fl
     ("class_id", "score", "doubt"), [(MUG, 0.28, 0.2), (MUG, 0.4, 0.0), (BOX, 0.28, 0.0)], ids=["weak", "sure", "a box"]
 )
 def test_a_weak_label_of_a_small_thing_is_doubted(class_id: int, score: float, doubt: float) -> None:
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
+    known = ObjectMap(3, ClassPriors([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
     for k in range(12):
         T = looking(0.4 * np.sin(k))
         seen = [replace(observation(THING, class_id, T), score=score)]
@@ -337,7 +338,7 @@ def test_a_weak_label_of_a_small_thing_is_doubted(class_id: int, score: float, d
 @pytest.mark.parametrize(("mugs", "balls", "doubt"), [(12, 0, 0.0), (6, 6, 1 / 7), (3, 9, 0.0)])
 def test_a_thing_called_a_mug_and_a_ball_alike_is_given_with_its_doubt(mugs: int, balls: int, doubt: float) -> None:
     """Labels of 0.6: by turns, that is a mean of 0.3 for each class."""
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
+    known = ObjectMap(3, ClassPriors([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
     labels = [MUG, BALL] * min(mugs, balls) + [MUG if mugs > balls else BALL] * abs(mugs - balls)
     for k, label in enumerate(labels):
         T = looking(0.4 * np.sin(k))
@@ -348,7 +349,9 @@ def test_a_thing_called_a_mug_and_a_ball_alike_is_given_with_its_doubt(mugs: int
 
 @pytest.mark.parametrize(("foot", "reaches_down"), [(0.2, True), (0.0, False)])
 def test_furniture_reaches_down_to_the_floor_where_its_class_stands_there(foot: float, reaches_down: bool) -> None:
-    known = ObjectMap(3, Kinds([], {BOX: (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=foot),)}), MapSettings())
+    known = ObjectMap(
+        3, ClassPriors([], {BOX: (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=foot),)}), MapSettings()
+    )
     known.floor = -0.4
     for k in range(6):
         seen = [observation(((2.5, 0.0, 0.12), (0.5, 0.5, 0.8)), BOX, looking(0.3 * np.sin(k)))]
@@ -358,7 +361,7 @@ def test_furniture_reaches_down_to_the_floor_where_its_class_stands_there(foot: 
 
 
 def test_views_from_afar_are_dropped_for_near_ones_and_a_snapshot_holds_those_kept() -> None:
-    known = ObjectMap(3, Kinds([], {BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}), MapSettings())
+    known = ObjectMap(3, ClassPriors([], {BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}), MapSettings())
     for k, back in enumerate([3.0, 2.8, 2.6, 2.4, 0.6, 0.5, 0.4, 0.3]):
         T = looking(0.1 * k)
         T[0, 3] = -back
@@ -380,7 +383,7 @@ def test_a_chair_before_a_desk_whose_masks_hold_both_does_not_move_the_desk() ->
         BOX: (SizePrior((0.6, 1.5, 0.75), (0.4, 0.4, 0.16)),),
         MUG: (SizePrior((0.1, 0.45, 0.7), (0.2, 0.2, 0.2)),),
     }
-    known = ObjectMap(3, Kinds([], sizes), MapSettings())
+    known = ObjectMap(3, ClassPriors([], sizes), MapSettings())
     for k in range(12):
         T = looking(0.4 * np.sin(k))
         whole, front = observation(desk, BOX, T), observation(chair, MUG, T)

@@ -17,8 +17,8 @@ from dataflow.testing import Played, play
 from operators.labels import SizePrior
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
-from operators.scene.map.cells import Cells
 from operators.scene.map.map_object import completed
+from operators.scene.map.voxels import VoxelSet
 
 SECOND = 1_000_000_000
 CRATE: Solid = ((2.5, 0.5, 0.25), (0.5, 0.4, 0.5), 0.3, 0)
@@ -160,10 +160,10 @@ def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
 
 
 def test_voxels_that_are_seen_through_go() -> None:
-    cells = Cells.of(np.array([[0.0, 0, 0], [1, 0, 0]]), 0.1)
+    voxels = VoxelSet.of(np.array([[0.0, 0, 0], [1, 0, 0]]), 0.1)
     for _ in range(3):
-        cells.carve(np.array([True, False]))
-    assert cells.points.tolist() == [[1, 0, 0]]
+        voxels.carve(np.array([True, False]))
+    assert voxels.points.tolist() == [[1, 0, 0]]
 
 
 def with_images(solids: Sequence[Solid], count: int = 10) -> list[tuple[Any, ...]]:
