@@ -6,32 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_graphs import scene_graph
 
 from dataflow.messages import Detections2D, SceneGraph
 from operators.labels import LabelSpace, labels_file
 from operators.scene.relations import FLOOR
 from operators.scene.scoring import PlainlySeen, RelationScore, score_nodes
 
-CLASSES = ("floor", "mug", "table", "ball")
-
 
 def graph(nodes: dict[int, tuple[str, float]], relations: list[tuple[int, str, int]]) -> SceneGraph:
     """Boxes of half a metre, by id: class and x."""
-    rows = [FLOOR, *nodes]
-    return SceneGraph(
-        stamp=0,
-        frame="world",
-        class_names=CLASSES,
-        predicates=tuple(p for _, p, _ in relations),
-        ids=np.array(rows),
-        class_ids=np.array([0, *(CLASSES.index(name) for name, _ in nodes.values())]),
-        scores=np.ones(len(nodes) + 1, np.float32),
-        positions=np.array([[0, 0, -0.1], *([x, 0, 1.0] for _, x in nodes.values())]),
-        sizes=np.array([[20, 20, 0.1], *([0.5, 0.5, 0.5] for _ in nodes)]),
-        subjects=np.array([rows.index(s) for s, _, _ in relations]),
-        objects=np.array([rows.index(o) for _, _, o in relations]),
-        relation_scores=np.ones(len(relations), np.float32),
-    )
+    things = [(id, name, (x, 0, 1.0), (0.5, 0.5, 0.5)) for id, (name, x) in nodes.items()]
+    scores = np.ones(len(nodes) + 1, np.float32)
+    return scene_graph([(FLOOR, "floor", (0, 0, -0.1), (20, 20, 0.1)), *things], relations, scores=scores)
 
 
 TRUTH = graph(

@@ -42,7 +42,7 @@ def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
 
 @pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
 def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
-    """Somebody walks straight past one mug to another, which lies on this side of a table or on that."""
+    """A person walks straight past one mug to another, which lies on this side of a table or on that."""
     mugs = [thing(2, "mug", 0.6, 0.3 * side), thing(3, "mug", 0.6, -0.3 * side)]
     found = after([(0.08 * k, 0.03 * side * k) for k in range(9)], mugs)
     assert max(found, key=lambda i: found[i]) == 2
@@ -81,12 +81,3 @@ def test_a_person_heads_for_what_it_walks_to_where_the_label_space_has_goals(
         now = graph.update(k * STEP, [table, other, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
     (act,) = now.acts
     assert act.goal == goal
-
-
-def test_a_restored_inference_goes_on_the_same() -> None:
-    goals = [thing(1, "door", 4, 0, size=1), thing(2, "chair", 0, 4, size=0.5)]
-    first, second = GoalInference(), GoalInference()
-    for k in range(8):
-        first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals)
-    second.restore(first.snapshot())
-    assert first.update(2.0, person(1.7, 0.8), goals) == second.update(2.0, person(1.7, 0.8), goals)

@@ -30,23 +30,19 @@ def entry(id: int, y: float, class_id: int = 0) -> MapObject:
 
 
 @pytest.mark.parametrize(
-    ("shared", "beside", "one"),
-    [(0.1, 0, False), (0.2, 0, True), (0.2, 2, True), (0.2, 4, False), (0.4, 4, True), (0.4, 20, True)],
-)
+    ("classes", "shared", "beside", "one"),
+    [
+        (1, 0.1, 0, False), (1, 0.2, 0, True), (1, 0.2, 2, True), (1, 0.2, 4, False), (1, 0.4, 4, True),
+        (1, 0.4, 20, True), (2, 0.3, 0, False), (2, 0.45, 0, True), (2, 0.45, 4, False),
+    ],
+)  # fmt: skip
 def test_entries_that_share_their_place_are_one_unless_views_show_them_beside_each_other(
-    shared: float, beside: int, one: bool
+    classes: int, shared: float, beside: int, one: bool
 ) -> None:
-    a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared))
+    a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared), classes - 1)
     a.beside[2] = beside
     assert are_one(a, b, PRIORS, 0.03) is one
     assert are_one(b, a, PRIORS, 0.03) is one
-
-
-@pytest.mark.parametrize(("shared", "beside", "one"), [(0.3, 0, False), (0.45, 0, True), (0.45, 4, False)])
-def test_entries_of_two_classes_are_one_where_they_share_more(shared: float, beside: int, one: bool) -> None:
-    a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared), 1)
-    a.beside[2] = beside
-    assert are_one(a, b, PRIORS, 0.03) is one
 
 
 def test_entries_that_are_one_are_among_those_that_may_be() -> None:
