@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from made_view import HEIGHT, Array, room, turned
+from repeated import assert_repeats
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import Imu, Odometry, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.testing import play
@@ -21,9 +21,17 @@ def cloud(points: Array, stamp: int = 0) -> PointCloud:
     return PointCloud(stamp=stamp, frame="depth", points=points.astype(np.float32))
 
 
+def related(parent: str, child: str, x: float = 0.0, stamp: int = 0) -> Transforms:
+    T = np.eye(4)
+    T[0, 3] = x
+    return Transforms.from_matrix(T, stamp=stamp, frame=parent, child_frame=child)
+
+
+COLOR, GIVEN = related("depth", "color"), related("base_link", "depth")
+
+
 def test_base_is_level_on_the_ground_below_the_camera() -> None:
-    known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
-    played = play(CameraMount(), {"cloud": [cloud(room(28, 5)), cloud(room(28, 5), 1)], "extrinsics": [known]})
+    played = play(CameraMount(), {"cloud": [cloud(room(28, 5)), cloud(room(28, 5), 1)], "extrinsics": [COLOR]})
     (made,) = played["base_extrinsics"]
     assert made.frames == ("depth", "base_link")
     T = made.matrix("depth")
@@ -57,10 +65,12 @@ def test_after_a_while_without_surfaces_a_guess_is_taken_with_a_warning() -> Non
     assert played["status"][0].levels.tolist() == [Level.WARN]
 
 
-def test_a_base_that_is_given_is_kept() -> None:
-    given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
-    (made,) = play(CameraMount(), {"cloud": [cloud(room(28, 5))], "extrinsics": [given]})["base_extrinsics"]
-    assert made.digest() == given.digest()
+def test_a_base_that_is_given_is_kept_and_passed_on_when_it_changes() -> None:
+    mount, then = CameraMount(), related("base_link", "depth", 0.1)
+    made = mount.process(cloud(room(28, 5)), GIVEN)
+    assert made["base_extrinsics"].digest() == GIVEN.digest()
+    again = mount.process(cloud(room(0, 0), 3), then)
+    assert again["base_extrinsics"].digest() == then.replace(stamp=3).digest()
 
 
 @pytest.mark.parametrize(("down", "wrong"), [(0, True), (28, False), (33, False)])
@@ -104,9 +114,8 @@ def _mounted(down: float) -> Array:
 
 def test_imu_of_a_frame_that_is_not_related_is_an_error() -> None:
     sample = Imu(stamp=0, frame="imu", angular_velocity=np.zeros(3), linear_acceleration=np.array([0, 0, 9.81]))
-    known = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
     with pytest.raises(Exception, match="no transform between 'imu' and 'depth'"):
-        play(CameraMount(), {"cloud": [cloud(room(0, 0))], "imu": [sample], "extrinsics": [known]})
+        play(CameraMount(), {"cloud": [cloud(room(0, 0))], "imu": [sample], "extrinsics": [COLOR]})
 
 
 def at_rest(down: float, roll: float, frame: str = "depth") -> Imu:
@@ -164,74 +173,31 @@ def test_the_ground_that_a_view_before_showed_counts_where_the_one_that_decides_
 
 
 def test_extrinsics_that_change_later_are_completed_again_with_the_same_mount() -> None:
-    first = Transforms.from_matrix(np.eye(4), stamp=0, frame="depth", child_frame="color")
-    moved = np.eye(4)
-    moved[0, 3] = 0.025
-    then = Transforms.from_matrix(moved, stamp=5, frame="depth", child_frame="color")
     mount = CameraMount()
-    made = mount.process(cloud(room(28, 0)), first)
-    assert mount.process(cloud(room(10, 0), 1), first) is None
-    again = mount.process(cloud(room(10, 0), 9), then)
+    made = mount.process(cloud(room(28, 0)), COLOR)
+    assert mount.process(cloud(room(10, 0), 1), COLOR) is None
+    again = mount.process(cloud(room(10, 0), 9), related("depth", "color", 0.025, 5))
     assert set(again) == {"base_extrinsics"}
     assert again["base_extrinsics"].stamp == 9
     assert again["base_extrinsics"].matrix("color")[:3, 3] == pytest.approx([0.025, 0, 0])
     np.testing.assert_array_equal(again["base_extrinsics"].matrix("depth"), made["base_extrinsics"].matrix("depth"))
 
 
-def test_a_given_base_is_passed_on_when_it_changes() -> None:
-    given = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="depth")
-    moved = np.eye(4)
-    moved[2, 3] = 0.1
-    then = Transforms.from_matrix(moved, stamp=0, frame="base_link", child_frame="depth")
-    mount = CameraMount()
-    assert mount.process(cloud(room(0, 0)), given) is not None
-    again = mount.process(cloud(room(0, 0), 3), then)
-    assert again["base_extrinsics"].digest() == then.replace(stamp=3).digest()
-
-
 @pytest.mark.parametrize("pair", [pytest.param(("depth", "color"), marks=pytest.mark.long), ("color", "depth")])
 def test_the_base_holds_all_cameras_whichever_is_the_parent(pair: tuple[str, str]) -> None:
-    T = np.eye(4)
-    T[0, 3] = 0.05
-    known = Transforms.from_matrix(T, stamp=0, frame=pair[0], child_frame=pair[1])
-    made = CameraMount().process(cloud(room(28, 5)), known)
-    alone = CameraMount().process(cloud(room(28, 5)))
-    expected = alone["base_extrinsics"].matrix("depth")
-    np.testing.assert_allclose(
-        transform_between(made["base_extrinsics"], "depth", "base_link"), expected, rtol=0, atol=1e-9
-    )
-    np.testing.assert_allclose(transform_between(made["base_extrinsics"], pair[1], pair[0]), T, rtol=0, atol=1e-9)
+    known = related(*pair, 0.05)
+    made, alone = (CameraMount().process(cloud(room(28, 5)), given)["base_extrinsics"] for given in (known, None))
+    expected = alone.matrix("depth")
+    np.testing.assert_allclose(transform_between(made, "depth", "base_link"), expected, rtol=0, atol=1e-9)
+    assert transform_between(made, pair[1], pair[0])[:3, 3] == pytest.approx([0.05, 0, 0], abs=1e-9)
 
 
-def test_a_restored_mount_remembers_its_best_view() -> None:
-    whole, first, later = (CameraMount(patience="2s") for _ in range(3))
-    doubtful = room(28, 5, floor=False)[:6000]  # a single wall
-    for each in (whole, first):
-        assert each.process(cloud(doubtful)) is None
-        assert each.state.best is not None
-    assert pack_state(first.snapshot() or {}) == pack_state(whole.snapshot() or {})
-    later.restore(unpack_state(pack_state(first.snapshot() or {})))
-    a, b = (each.process(cloud(NOTHING, 2_000_000_000)) for each in (whole, later))
-    assert {name: m.digest() for name, m in a.items()} == {name: m.digest() for name, m in b.items()}
-
-
-def test_equal_views_give_equal_mounts() -> None:
-    streams = {"cloud": [cloud(NOTHING), cloud(room(28, 5), 1)]}
-    assert play(CameraMount(), streams).digests() == play(CameraMount(), streams).digests()
-
-
-def test_a_restored_mount_waits_as_long_as_one_that_went_on() -> None:
-    whole, first, later = (CameraMount(patience="2s") for _ in range(3))
-    for each in (whole, first):
-        assert each.process(cloud(NOTHING)) is None
-    later.restore(unpack_state(pack_state(first.snapshot() or {})))
-    answers = [each.process(cloud(NOTHING, 2_000_000_000)) for each in (whole, later)]
-    assert [{name: m.digest() for name, m in (a or {}).items()} for a in answers[1:]] == [
-        {name: m.digest() for name, m in answers[0].items()}
-    ]
-    restored = CameraMount()
-    restored.restore(unpack_state(pack_state(later.snapshot() or {})))
-    assert restored.process(cloud(room(28, 5), 3_000_000_000)) is None  # decided, and nothing changed since
+@pytest.mark.parametrize("at", [1, 2], ids=["before it is decided", "after"])
+@pytest.mark.parametrize("first", [NOTHING, room(28, 5, floor=False)[:6000]], ids=["nothing", "a single wall"])
+def test_mounts_repeat_and_a_restored_one_knows_since_when_and_the_best_view(first: Array, at: int) -> None:
+    calls = [(cloud(first),), (cloud(NOTHING, 2_000_000_000),), (cloud(room(28, 5), 3_000_000_000),)]
+    made = assert_repeats(CameraMount, calls, at)
+    assert [sorted(each) for each in made] == [[], ["base_extrinsics", "status"], []]
 
 
 def test_a_clock_that_begins_anew_decides_anew() -> None:

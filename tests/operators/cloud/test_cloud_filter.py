@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from repeated import assert_repeats
 
 from dataflow.messages import PointCloud
 from dataflow.testing import play
@@ -133,13 +136,6 @@ def test_parameters_that_contradict_each_other_are_named(params: dict[str, objec
         CloudFilter(**params).setup()
 
 
-def test_two_plays_are_equal_and_a_restored_operator_sums_up_alike() -> None:
-    params = {"voxel": 0.1, "outlier_neighbours": 8, "normal_neighbours": 10}
-    clouds = [cloud(room(k), stamp=k + 1) for k in range(2)]
-    first, again = CloudFilter(**params), CloudFilter(**params)
-    assert play(first, {"cloud": clouds}).digests() == play(again, {"cloud": clouds}).digests()
-    restored = CloudFilter(**params)
-    restored.setup()
-    restored.restore(first.snapshot())
-    assert restored.summary() == first.summary()
-    assert first.summary()["points"] == 6000
+def test_filters_repeat_and_a_restored_one_sums_up_alike() -> None:
+    make = partial(CloudFilter, voxel=0.1, outlier_neighbours=8, normal_neighbours=10)
+    assert_repeats(make, [(cloud(room(k), stamp=k + 1),) for k in range(2)], 1)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from repeated import assert_repeats
 
 from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose
 from dataflow.messages.geometry import quaternion_from_yaw
@@ -129,15 +130,8 @@ def test_points_on_a_line_or_in_one_place_have_a_flat_box() -> None:
     assert features.tolist() == [[0, 0, 0, 0]]
 
 
-def test_two_plays_are_equal_and_a_restored_operator_sums_up_alike() -> None:
-    clouds = [cloud(bar((1, 0, 0), (0.5, 0.4, 0.3), 0.2, 800, seed=k), k + 1) for k in range(2)]
-    first, again = Clusterer(), Clusterer()
-    assert play(first, {"cloud": clouds}).digests() == play(again, {"cloud": clouds}).digests()
-    restored = Clusterer()
-    restored.setup()
-    restored.restore(first.snapshot())
-    assert restored.summary() == first.summary()
-    assert first.summary()["clusters"] == 2
+def test_clusterers_repeat_and_a_restored_one_sums_up_alike() -> None:
+    assert_repeats(Clusterer, [(cloud(bar((1, 0, 0), (0.5, 0.4, 0.3), 0.2, 800, seed=k), k + 1),) for k in range(2)], 1)
 
 
 def test_a_turned_bar_gives_the_turn_of_its_box() -> None:

@@ -112,7 +112,7 @@ def test_a_detection_takes_8_bytes_once_it_is_matched() -> None:
     assert sum(len(held) * held.itemsize for held in kept) == 8 * sum(len(one.labels) for one in frames)
 
 
-def test_classes_that_nobody_saw_have_no_score() -> None:
+def test_classes_without_objects_have_no_score() -> None:
     assert score_frames([], ["mug"], max_detections=9, iou=0.5, score_threshold=0.5) == {
         "mug": ClassScore(0, 0, 0, None, None, 0, 0)
     }

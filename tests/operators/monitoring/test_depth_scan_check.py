@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Odometry, PointCloud, Transforms
@@ -66,14 +67,6 @@ def test_the_misfit_is_what_makes_scans_lie_on_the_depth() -> None:
     assert found.turn == pytest.approx([-0.02, 0.03, -0.01], abs=0.006)
 
 
-def test_what_shows_no_common_surface_changes_nothing() -> None:
-    agreement = DepthScanAgreement()
-    T = np.linalg.inv(T_BASE_DEPTH) @ T_BASE_LIDAR
-    assert not agreement.add(np.zeros((240, 320), np.float32), K, np.ones((50, 3)), T)
-    assert not agreement.add(np.full((240, 320), 2.0, np.float32), K, np.zeros((0, 3)), T)
-    assert agreement.misfit().angle == 0
-
-
 def test_scans_with_times_are_deskewed_by_the_velocity_or_left_out() -> None:
     clouds, depths = pairs()
     turn = 0.8
@@ -94,13 +87,6 @@ def test_scans_with_times_are_deskewed_by_the_velocity_or_left_out() -> None:
     assert untold["status"][-1].pairs(0)["without a velocity"] == "14"
 
 
-def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
-    clouds, depths = pairs(1.05)
-    first, second = DepthScanCheck(), DepthScanCheck()
-    first.setup()
-    second.setup()
-    for cloud, depth in list(zip(clouds, depths, strict=True))[:6]:
-        first.process(cloud, depth, info("depth"), extrinsics())
-    second.restore(first.snapshot())
-    results = [each.process(clouds[6], depths[6], info("depth"), extrinsics()).digest() for each in (first, second)]
-    assert results[0] == results[1]
+def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+    calls = [(cloud, depth, info("depth"), extrinsics()) for cloud, depth in zip(*pairs(1.05), strict=True)]
+    assert_repeats(DepthScanCheck, calls[:7], 6)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 from scipy.spatial.transform import Rotation
 
 from dataflow import Played, play
@@ -89,17 +90,15 @@ def extrinsics(sensor: str = "", axis: str = "z", angle: float = 0.0) -> Transfo
     )
 
 
-def checked(known: Transforms | None = None, **changed: Any) -> Played:
+def checked(known: Transforms | None = None, operator: MotionCheck | None = None, **changed: Any) -> Played:
+    lidar, camera = changed.get("lidar", odometry("lidar", 20, 2)), changed.get("camera", odometry("camera", 10, 1))
     given: dict[str, Any] = {
         "wheels": changed.get("wheels", wheels()),
-        "motions": {
-            "camera": changed.get("camera", odometry("camera", 10, 1)),
-            "lidar": changed.get("lidar", odometry("lidar", 20, 2)),
-        },
+        "motions": {name: stream for name, stream in (("camera", camera), ("lidar", lidar)) if stream is not None},
         "imu": {"imu": changed.get("imu", gyroscope())},
         "extrinsics": [known or extrinsics()],
     }
-    return play(MotionCheck(), given, static=["extrinsics"])
+    return play(operator or MotionCheck(), given, static=["extrinsics"])
 
 
 def warnings(played: Played) -> list[str]:
@@ -177,48 +176,28 @@ def test_readings_that_are_not_finite_are_counted_and_left_out(wrong: float) -> 
     turned[500] = turned[500].replace(angular_velocity=[wrong, 0, 0])
     carried[50] = carried[50].replace(position=[wrong, 0, 0])
     operator = MotionCheck()
-    given: dict[str, Any] = {
-        "wheels": driven,
-        "motions": {"camera": carried, "lidar": odometry("lidar", 20, 2)},
-        "imu": {"imu": turned},
-        "extrinsics": [extrinsics()],
-    }
-    played = play(operator, given, static=["extrinsics"])
+    played = checked(operator=operator, wheels=driven, camera=carried, imu=turned)
     assert warnings(played) == []
     assert [m.stamp for m in played["checked"]] == [m.stamp for m in driven if m is not driven[40]]
     counted = {name: n for name, n in operator.summary().items() if "not finite" in name}
     assert counted == {"gyroscope of imu: not finite": 1, "motions/camera: not finite": 1, "wheels: not finite": 1}
 
 
-def test_of_two_nobody_knows_which_is_wrong_and_wheels_still_pass() -> None:
-    given = {
-        "wheels": wheels(1.05),
-        "motions": {"lidar": odometry("lidar", 20, 2)},
-        "extrinsics": [extrinsics()],
-    }
-    played = play(MotionCheck(), given, static=["extrinsics"])
+def test_of_two_it_is_open_which_is_wrong_and_wheels_still_pass() -> None:
+    played = checked(wheels=wheels(1.05), camera=None, imu=[])
     assert warnings(played)[-1].startswith("motions/lidar: ")
     assert len(played["checked"]) == len(wheels())
 
 
-def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
-    first, second = MotionCheck(), MotionCheck()
-    first.setup()
-    given = {"wheels": wheels(1.05), "camera": odometry("camera", 10, 1), "lidar": odometry("lidar", 20, 2)}
+def test_checks_repeat_and_a_restored_one_goes_on() -> None:
     by_stamp: dict[int, dict[str, Odometry]] = {}
-    for name, messages in given.items():
+    for name, messages in (
+        ("wheels", wheels(1.05)), ("camera", odometry("camera", 10, 1)), ("lidar", odometry("lidar", 20, 2)),
+    ):  # fmt: skip
         for message in messages:
             by_stamp.setdefault(message.stamp, {})[name] = message
-
-    def fed(check: MotionCheck, stamp: int) -> list[bytes]:
-        now = by_stamp[stamp]
+    calls = []
+    for stamp, now in sorted(by_stamp.items())[:160]:
         motions = {f"robot/motions/{name}": m for name, m in now.items() if name != "wheels"}
-        made = check.process(SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics())
-        return [made[name].digest() for name in sorted(made)]
-
-    stamps = sorted(by_stamp)
-    for stamp in stamps[:100]:
-        fed(first, stamp)
-    second.setup()
-    second.restore(first.snapshot())
-    assert [fed(first, s) for s in stamps[100:160]] == [fed(second, s) for s in stamps[100:160]]
+        calls.append((SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics()))
+    assert_repeats(MotionCheck, calls, 100)

@@ -26,12 +26,6 @@ def test_vectors_have_length_one_and_are_alike_for_alike_things(good_classifier:
     assert np.mean(nearest % 3 == np.arange(len(shown)) % 3) >= 0.9
 
 
-def test_equal_images_give_equal_vectors(classifier: Path) -> None:
-    shown = [image(picture(shape, 40 + i), i) for i, shape in enumerate(SHAPES)]
-    runs = [play(FeatureExtractor(weights=str(classifier)), {"image": shown}).digests() for _ in range(2)]
-    assert runs[0] == runs[1]
-
-
 @pytest.mark.long
 def test_an_object_has_the_vector_of_its_part_of_the_image_and_its_id(good_classifier: Path) -> None:
     shown, boxes = scene()

@@ -45,12 +45,3 @@ def test_the_likeliest_has_one_and_none_has_nothing(looks: list[list[float]], we
     assert found.min() >= 0.01**weight * 0.99
     if weight == 0:
         assert (found == 1).all()
-
-
-def test_looks_go_on_after_a_snapshot() -> None:
-    first, second = PostureWindow(), PostureWindow()
-    first.update(0.0, probabilities(0.7, 0.3))
-    second.restore(first.snapshot())
-    for each in (first, second):
-        each.update(0.4, probabilities(0.5, 0.5))
-    assert str(first.evidence(1.0)) == str(second.evidence(1.0))
