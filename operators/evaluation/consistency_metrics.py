@@ -9,14 +9,7 @@ from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
 from operators.association import mutually_nearest
 from operators.estimation.chi_square import quantile
-from operators.evaluation.consistency import (
-    Innovations,
-    band,
-    covariance_of,
-    innovations,
-    normalised,
-    pose_error,
-)
+from operators.evaluation.consistency import Innovations, band, covariance_of, innovations, normalised, pose_error
 from operators.evaluation.figures import Figures
 
 Array = NDArray[np.float64]
@@ -55,10 +48,7 @@ class ConsistencyMetrics(Figures, Operator):
         self._passed_over = self._truths_not_finite = 0
 
     def process(
-        self,
-        estimate: Pose | Odometry,
-        ground_truth: tuple[Pose | Odometry, ...],
-        status: Diagnostics | None = None,
+        self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...], status: Diagnostics | None = None
     ) -> None:
         """Raises ValueError where estimate and truth are of different frames."""
         for truth in ground_truth:

@@ -62,10 +62,7 @@ class TrajectoryPlots(Figures, Operator):
         self._unpaired = 0
 
     def process(
-        self,
-        estimate: Pose | Odometry,
-        ground_truth: tuple[Pose | Odometry, ...],
-        status: Diagnostics | None = None,
+        self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...], status: Diagnostics | None = None
     ) -> Mapping[str, Any]:
         """Raises ValueError where estimate and truth pose different child frames."""
         if ground_truth:

@@ -179,12 +179,7 @@ def _placed(
 
 
 def _on_top(
-    found: dict[Relation, float],
-    body: Body,
-    tops: Sequence[Body],
-    hidden: float,
-    boxes: BoxPairs,
-    rules: RelationRules,
+    found: dict[Relation, float], body: Body, tops: Sequence[Body], hidden: float, boxes: BoxPairs, rules: RelationRules
 ) -> None:
     """Finds the surface above the floor that a thing stands or lies on; `hidden` as in `_placed`."""
     best: tuple[float, int] = (0.0, 0)

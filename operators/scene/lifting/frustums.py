@@ -206,13 +206,7 @@ def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
 
 
 def _of_class(
-    near: Indices,
-    inner: Mask,
-    classes: NDArray[np.int32] | None,
-    first: int,
-    wanted: int,
-    body: bool,
-    s: LiftSettings,
+    near: Indices, inner: Mask, classes: NDArray[np.int32] | None, first: int, wanted: int, body: bool, s: LiftSettings
 ) -> Indices | None:
     """Returns the points `near` a box that are in it and of its class in the mask; None where these are too few.
 
@@ -227,12 +221,7 @@ def _of_class(
 
 
 def _body(
-    seen: Seen,
-    columns: Array,
-    lines: Array,
-    own: Mask,
-    box: tuple[float, float, float, float],
-    s: LiftSettings,
+    seen: Seen, columns: Array, lines: Array, own: Mask, box: tuple[float, float, float, float], s: LiftSettings
 ) -> tuple[Indices, float] | None:
     """Returns the points of the body that a box is around, and the share of its mask in the box that they are.
 
@@ -325,12 +314,7 @@ def _object(
 
 
 def _best(
-    seen: Seen,
-    parts: Sequence[_Part],
-    box: tuple[float, float, float, float],
-    s: LiftSettings,
-    *,
-    masked: bool,
+    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
 ) -> tuple[_Part, float]:
     """Returns the part, grown by others near it, that is the object of a box, and the overlap of its image with it.
 

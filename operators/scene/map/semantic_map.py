@@ -91,8 +91,7 @@ class SemanticMap(Operator):
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
     images: Sampled[Detections2D] = Sampled(
-        required=False,
-        doc="the image's boxes of the same objects, in their order; not used where of another stamp",
+        required=False, doc="the image's boxes of the same objects, in their order; not used where of another stamp"
     )
     image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
     surfaces: Sampled[Boxes3D] = Sampled(

@@ -41,7 +41,7 @@ def scan(points: np.ndarray, k: int) -> PointCloud:
 
 @pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
 @pytest.mark.parametrize("made", OPERATORS, ids=lambda made: made.__name__)
-def test_a_bad_cloud_among_good_ones_is_survived_and_said(made: Any, bad: np.ndarray) -> None:
+def test_bad_cloud_among_good_ones_is_survived_and_reported(made: Any, bad: np.ndarray) -> None:
     played = play(made(), {"cloud": [scan(room(), 0), scan(bad, 1), scan(room() + np.float32(0.01), 2)]})
     said = {m.stamp: m for m in played["status"] if isinstance(m, Diagnostics)}
     assert len(said) == 3

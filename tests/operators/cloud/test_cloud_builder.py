@@ -150,7 +150,7 @@ def test_clouds_of_a_sequence_agree_in_the_world() -> None:
         (2.0, 5000.0, "3072 points of 3072 pixels; the colour camera sees none of them"),
     ],
 )
-def test_the_status_says_what_became_of_the_pixels(depth: float, focal: float, text: str) -> None:
+def test_status_counts_pixels_and_points(depth: float, focal: float, text: str) -> None:
     builder = CloudBuilder(stride=1)
     given = depth_image(np.full((HEIGHT, WIDTH), depth))
     aside = Transforms.from_matrix(np.eye(4) + np.eye(4, k=3), stamp=0, frame="color", child_frame="depth")

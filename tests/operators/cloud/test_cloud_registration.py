@@ -83,7 +83,7 @@ def explained_at_the_truth(one: np.ndarray, other: np.ndarray, A: np.ndarray, B:
     return refine(source, target, invert(A) @ B, Settings(0.1, 1, 0.5, 0.85, 0.04))
 
 
-def test_thin_things_and_somebody_who_walks_are_no_contradiction() -> None:
+def test_thin_things_and_a_walking_person_are_no_contradiction() -> None:
     """Beams pass beside poles, so the same poles are seen before and behind them from two places."""
     poles = np.array([[x, y, 1.2, 0.02, 0.02, 1.2] for x in (-1.8, 1.8) for y in (-1.5, -0.5, 0.5, 1.5)])
     A, B = at(0.2, 0.1, 0.0), at(0.9, -0.2, 0.6)
@@ -97,7 +97,7 @@ def test_thin_things_and_somebody_who_walks_are_no_contradiction() -> None:
     ).reason  # fmt: skip
 
 
-def test_a_long_room_is_told_about_its_length() -> None:
+def test_long_room_is_registered_along_its_length() -> None:
     """Its walls are near to its long axis, which is no reason to doubt how it is turned about that."""
     long = np.array([9.0, 0.9, 1.2])
     niches = np.array([[x, y, 1.0, 0.3, 0.2, 1.0] for x, y in ((-6, 0.8), (-3, -0.8), (1, 0.8), (4, -0.8), (7, 0.8))])
@@ -186,7 +186,7 @@ def test_a_bare_passage_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((500, 3), np.nan), np.ones((50, 3))])
-def test_a_cloud_that_tells_nothing_fails(points: np.ndarray) -> None:
+def test_empty_or_featureless_cloud_fails(points: np.ndarray) -> None:
     outputs = registered(points, scan(at(0, 0, 0), 1))
     assert reason(outputs) == "failed: fewer than 100 voxels with a normal"
 

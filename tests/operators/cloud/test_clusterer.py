@@ -34,7 +34,7 @@ def clustered(points: np.ndarray, **params: Any) -> tuple[Clusters, Boxes3D, np.
     return clusters, boxes, features.vectors, status.pairs(0)
 
 
-def test_groups_are_told_apart_and_boxed() -> None:
+def test_groups_are_separated_and_boxed() -> None:
     parts = [bar((1, 0, 0.5), (0.6, 0.2, 0.3), 0.5, 3000), bar((2, 1, 0.2), (0.3, 0.3, 0.4), 0, 3000)]
     noise = np.array([[5.0, 5, 5], [-4, 2, 1], [np.nan, 0, 0]])
     clusters, boxes, features, counts = clustered(np.concatenate([*parts, noise]))

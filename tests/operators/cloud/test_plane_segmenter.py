@@ -125,7 +125,7 @@ def test_the_hull_of_a_plane_is_what_is_seen_of_it() -> None:
         assert on.max() < 1e-4  # no corner lies outside of an edge
 
 
-def test_without_a_pose_the_parameter_says_which_way_is_up() -> None:
+def test_up_is_the_parameter_without_a_pose() -> None:
     T = optical()
     given = cloud(room(), T)
     _, surfaces, _ = segmented(given, up=tuple(T[2, :3]))

@@ -32,7 +32,7 @@ def test_errors_are_those_of_the_pixels_that_both_have() -> None:
     assert figures["within_25_percent"] == pytest.approx(2 / 3)
 
 
-def test_means_are_over_images_and_the_worst_is_told() -> None:
+def test_means_are_over_images_beside_the_worst() -> None:
     true = [image([[2.0]], stamp) for stamp in (10, 20, 30)]
     found = [image([[2.5]], 10), image([[3.0]], 20), image([[0.0]], 30)]
     figures = scored(found, true)

@@ -180,11 +180,7 @@ def test_precision_and_recall_are_those_of_the_operating_point() -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [
-        ({"frame": "other"}, "of one camera"),
-        ({"width": 150}, "aspect ratios"),
-        ({"names": ()}, "has no class_names"),
-    ],
+    [({"frame": "other"}, "of one camera"), ({"width": 150}, "aspect ratios"), ({"names": ()}, "has no class_names")],
 )
 def test_boxes_that_cannot_be_compared_are_refused(wrong: dict[str, Any], message: str) -> None:
     metrics = DetectionMetrics()

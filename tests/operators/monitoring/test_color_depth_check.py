@@ -116,7 +116,7 @@ def test_a_displaced_or_turned_camera_is_found_with_what_puts_it_right_where_it_
     assert text.endswith("a camera is turned or displaced against its extrinsic")
 
 
-def test_calibration_brings_the_camera_nearer_step_by_step_and_says_by_what() -> None:
+def test_calibration_brings_the_camera_nearer_step_by_step_and_reports_it() -> None:
     text, given = finding(ColorDepthCheck(period="200ms", calibrate=True), displaced(0.12))
     away = [float(np.linalg.norm(transform_between(each, "color", "depth")[:3, 3])) for each in given]
     assert len(away) >= 2

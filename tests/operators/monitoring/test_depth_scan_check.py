@@ -42,7 +42,7 @@ def test_sensors_that_fit_raise_no_alarm() -> None:
 @pytest.mark.parametrize(
     ("scale", "text"), [pytest.param(1.05, "5.0% too long", marks=pytest.mark.long), (0.96, "4.0% too short")]
 )
-def test_depths_of_another_scale_are_said_with_the_scale(scale: float, text: str) -> None:
+def test_depths_of_another_scale_are_reported_with_the_scale(scale: float, text: str) -> None:
     said = warnings(checked(extrinsics(), scale))
     assert len(said) >= 8
     assert text in said[-1]
@@ -50,7 +50,7 @@ def test_depths_of_another_scale_are_said_with_the_scale(scale: float, text: str
 
 @pytest.mark.parametrize("sensor", ["depth", "lidar"])
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_a_sensor_that_is_turned_is_said_within_seconds(sensor: str, axis: str) -> None:
+def test_turned_sensor_is_reported_within_seconds(sensor: str, axis: str) -> None:
     said = warnings(checked(extrinsics(**{sensor: (axis, 3.0)})))
     assert len(said) >= 5
     assert "turned by" in said[-1]

@@ -136,7 +136,7 @@ def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
 
 
 @pytest.mark.parametrize("sensor", [pytest.param("wheels", marks=pytest.mark.long), "imu"])
-def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_not(sensor: str) -> None:
+def test_sensor_that_repeats_a_reading_of_motion_is_reported_and_one_at_rest_is_not(sensor: str) -> None:
     given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
     held = next(m for m in given if m.stamp >= 6_000_000_000)
     hung = [held.replace(stamp=m.stamp) if 6 <= m.stamp * 1e-9 < 7.5 else m for m in given]

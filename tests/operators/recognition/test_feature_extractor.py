@@ -90,7 +90,7 @@ def test_an_embedding_by_name_describes_what_text_describes_too(
     assert described.any(axis=0).all(), "each is described in some image"
 
 
-def test_weights_that_are_missing_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torchvision", reason="needs the extra [torch]")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(OperatorFailure, match="are not on this machine"):

@@ -22,8 +22,7 @@ def graph(nodes: dict[int, tuple[str, float]], relations: list[tuple[int, str, i
 
 
 TRUTH = graph(
-    {11: ("mug", 1.0), 12: ("table", 2.0), 13: ("ball", 3.0)},
-    [(11, "near", 12), (12, "near", 13), (12, "on", FLOOR)],
+    {11: ("mug", 1.0), 12: ("table", 2.0), 13: ("ball", 3.0)}, [(11, "near", 12), (12, "near", 13), (12, "on", FLOOR)]
 )
 
 

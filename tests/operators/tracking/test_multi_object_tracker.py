@@ -108,7 +108,7 @@ def test_one_false_box_confirms_no_track() -> None:
     assert ids(messages[-1], *TrackState) == []
 
 
-def test_an_end_is_told_once_and_its_id_is_not_used_again() -> None:
+def test_ended_track_is_listed_once_and_its_id_is_not_used_again() -> None:
     seen = [image(k, [walker(100)]) for k in range(4)]
     gone = [image(k, []) for k in range(4, 30)]
     messages = tracked([*seen, *gone, *(image(k, [walker(100)]) for k in range(30, 34))])

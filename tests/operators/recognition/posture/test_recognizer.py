@@ -96,7 +96,7 @@ def likeliest(message: Classification) -> str:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.8, np.pi])
-def test_who_stands_is_not_taken_for_who_sits_and_the_other_way_round(turn: float) -> None:
+def test_standing_and_sitting_bodies_are_not_confused(turn: float) -> None:
     upright = []
     for parts in (STANDING, SITTING):
         message = judged(look(parts, turn=turn))

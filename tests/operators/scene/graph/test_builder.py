@@ -311,8 +311,7 @@ def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
 def test_a_vehicle_out_of_sight_may_have_stopped(moving: float, ago: float, said: str) -> None:
     nodes = [
         room(k, [(2, "car", (8, 3, 0.7), (4, 1.8, 1.5)), TABLE]).replace(
-            moving=np.array([moving, np.nan], np.float32),
-            last_seen=np.array([(k + 1) * STEP - round(ago * 1e9)] * 2),
+            moving=np.array([moving, np.nan], np.float32), last_seen=np.array([(k + 1) * STEP - round(ago * 1e9)] * 2)
         )
         for k in range(4)
     ]

@@ -41,7 +41,7 @@ def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
 
 
 @pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
-def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
+def test_goal_of_a_path_is_symmetric_in_left_and_right(side: int) -> None:
     """A person walks straight past one mug to another, which lies on this side of a table or on that."""
     mugs = [thing(2, "mug", 0.6, 0.3 * side), thing(3, "mug", 0.6, -0.3 * side)]
     found = after([(0.08 * k, 0.03 * side * k) for k in range(9)], mugs)
@@ -59,7 +59,7 @@ def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
     assert late[1] < 0.5 * late[2]
 
 
-def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -> None:
+def test_jitter_of_a_still_box_leaves_goals_as_they_are() -> None:
     rng = np.random.default_rng(3)
     chair = [thing(1, "chair", 0.44, 0.0, size=0.5, z=0.4)]
     still = after([(0.0, 0.0)] * 40, chair)

@@ -81,7 +81,7 @@ def test_a_node_that_is_nowhere_is_named_with_the_nearest() -> None:
         told("mug 3")
 
 
-def test_the_command_tells_it_up_to_a_time(tmp_path: Path) -> None:
+def test_command_shows_history_up_to_a_time(tmp_path: Path) -> None:
     file = tmp_path / "room.mcap"
     with RecordingWriter(file, metadata={}) as writer:
         writer.add_stream("robot1/scene/graph", SceneGraph)

@@ -214,11 +214,7 @@ def test_an_export_is_not_replaced_unasked(recording: Path, tmp_path: Path) -> N
     [
         (["--query", "cup on table"], 2, "'cup' is no class of this graph"),
         (["--query", "something to drink from"], 2, "'to' is no relation"),
-        (
-            ["--query", "something to drink from"],
-            2,
-            "no embeddings; dataflow models get clip_vit_b32, then run",
-        ),
+        (["--query", "something to drink from"], 2, "no embeddings; dataflow models get clip_vit_b32, then run"),
         (["--stream", "other"], 2, "robot1/scene/graph"),
         (["--at", "99"], 0, "nothing is newer than 2.0 s"),
         ([], 0, "who does what"),
@@ -226,9 +222,7 @@ def test_an_export_is_not_replaced_unasked(recording: Path, tmp_path: Path) -> N
         (["--nodes"], 0, "position, m"),
     ],
 )
-def test_the_command_names_what_is_wrong_or_tells_the_graph(
-    recording: Path, words: list[str], code: int, told: str
-) -> None:
+def test_command_shows_the_graph_or_names_the_error(recording: Path, words: list[str], code: int, told: str) -> None:
     found, out = asked(str(recording), *words)
     assert (found, told in " ".join(out.split())) == (code, True)
     assert ("newer" in out) == (words[:1] == ["--at"])

@@ -10,14 +10,7 @@ import pytest
 from made_scene import INFO, Solid, camera, look
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import (
-    Boxes3D,
-    CameraInfo,
-    PointCloud,
-    Tracks,
-    Transforms,
-    pack_masks,
-)
+from dataflow.messages import Boxes3D, CameraInfo, PointCloud, Tracks, Transforms, pack_masks
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter

@@ -123,7 +123,7 @@ def test_where_a_sharp_camera_looks_an_edge_strays_by_more_pixels() -> None:
     assert by_fine < 2.0 * coarse
 
 
-def test_a_fit_tells_which_view_is_of_another_thing() -> None:
+def test_fit_reveals_the_view_of_another_thing() -> None:
     beside: Box = (BOOK[0] + [0, 0.07, 0], BOOK[1], BOOK[2])
     views = [view_of(beside if k == 2 else BOOK, y, 0.5) for k, y in enumerate(SIDEWAYS)]
     points = spine(BOOK)

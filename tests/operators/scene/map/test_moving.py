@@ -88,7 +88,7 @@ def test_a_truck_that_overtakes_drives_though_its_side_looks_alike_and_its_rear_
     assert judged(lambda t: place(0), 2.0, 2).moving < 0.4
 
 
-def test_nothing_tells_of_the_first_view_and_a_restored_memory_goes_on_the_same() -> None:
+def test_motion_is_open_at_the_first_view_and_a_restored_memory_goes_on() -> None:
     eye = np.array([0.0, 0.0, 1.7])
     points, of = scanned([HOUSE, beside(8)], eye)
     vehicle = MapObject(7, VoxelSet.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
@@ -122,7 +122,7 @@ def test_the_places_of_a_car_of_a_few_voxels_say_nothing_and_its_centre_counts()
     assert np.isnan(car.moving)
 
 
-def test_what_is_known_of_a_car_outlasts_a_view_that_says_nothing() -> None:
+def test_knowledge_of_a_car_outlasts_an_empty_view() -> None:
     recent, voxels = RecentPlaces(0.1), VoxelSet.of(np.array([[8.0, 3, 1]]), SIDE)
     car = MapObject(7, voxels, np.array([1.0]), 1.0, 0, 0)
     empty = RangeView(np.zeros((0, 3)), np.eye(4), 0.012)

@@ -223,7 +223,7 @@ def test_a_mug_farther_away_than_an_arm_reaches_is_another() -> None:
     assert len(held([(1.7, -1.4, 0.3)] * 5, behind=False)) == 2
 
 
-def test_the_height_of_a_person_over_the_floor_tells_how_deep_the_box_is() -> None:
+def test_height_of_a_person_over_the_floor_decides_the_depth_of_the_box() -> None:
     standing = SizePrior((0.4, 0.57, 1.64), (0.3, 0.2, 0.1), True, foot=1.0)
     sitting = SizePrior((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, foot=1.0)
     depths = []
@@ -262,7 +262,7 @@ def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("rate", [10, 20, 50])
-def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int) -> None:
+def test_evidence_is_independent_of_the_rate_of_images(rate: int) -> None:
     known = mapping()
     T, nothing = looking(0.0), RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
     for k in range(rate * 2 // 5 + 1):

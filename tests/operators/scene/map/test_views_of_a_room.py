@@ -49,7 +49,7 @@ def test_a_round_room_has_no_heading() -> None:
     assert heading.angle is None
 
 
-def test_a_view_of_nothing_upright_tells_no_heading() -> None:
+def test_view_of_nothing_upright_gives_no_heading() -> None:
     heading = RoomHeading()
     heading.add(np.zeros((0, 3)))
     heading.add(np.column_stack([RNG.uniform(0, 4, (3000, 2)), np.zeros(3000)]))
@@ -57,11 +57,8 @@ def test_a_view_of_nothing_upright_tells_no_heading() -> None:
     assert heading.angle is None
 
 
-@given(
-    st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-4, 4)),
-    st.floats(0.05, 1.0),
-)
-def test_what_a_view_tells_of_is_never_ruled_out(center: tuple[float, float, float], radius: float) -> None:
+@given(st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-4, 4)), st.floats(0.05, 1.0))
+def test_observed_places_are_never_ruled_out(center: tuple[float, float, float], radius: float) -> None:
     """Places in a sphere of which the view knows something, though the sphere is said not to be shown."""
     rays = np.column_stack([RNG.uniform(-0.5, 0.5, 2000), RNG.uniform(-0.4, 0.4, 2000), np.ones(2000)])
     view = RangeView(rays * 3.0, np.eye(4), 0.012)
