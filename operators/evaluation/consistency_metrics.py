@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
-from operators.association import mutually_nearest
 from operators.estimation.chi_square import quantile
 from operators.evaluation.consistency import Innovations, band, covariance_of, innovations, normalised, pose_error
 from operators.evaluation.figures import Figures
+from operators.evaluation.pairing import Pairing
 
 Array = NDArray[np.float64]
 
@@ -40,10 +40,7 @@ class ConsistencyMetrics(Figures, Operator):
 
     def setup(self) -> None:
         super().setup()
-        self._stamps: list[int] = []
-        self._estimates: list[tuple[Pose | Odometry, Array]] = []
-        self._true_stamps: list[int] = []
-        self._truths: list[Pose | Odometry] = []
+        self._pairing: Pairing[tuple[Pose | Odometry, Array], Pose | Odometry] = Pairing(self.tolerance)
         self._innovations: Innovations = {}
         self._passed_over = self._truths_not_finite = 0
 
@@ -64,27 +61,22 @@ class ConsistencyMetrics(Figures, Operator):
             if not (np.isfinite(truth.position).all() and np.isfinite(truth.orientation).all()):
                 self._truths_not_finite += 1
                 continue
-            self._true_stamps.append(truth.stamp)
-            self._truths.append(truth)
+            self._pairing.add_truth(truth.stamp, truth)
         if status is not None:
             self._innovations |= innovations(status)
         covariance = covariance_of(estimate)
         if covariance is None:
             self._passed_over += 1
-            return
-        self._stamps.append(estimate.stamp)
-        self._estimates.append((estimate, covariance))
+        else:
+            self._pairing.add_found(estimate.stamp, (estimate, covariance))
 
     def finish(self) -> None:
         """Computes the figures."""
-        pairs = mutually_nearest(self._stamps, self._true_stamps, self.tolerance)
+        pairs = self._pairing.finish()
         self._figures = {"matched": len(pairs), "estimates without finite covariance": self._passed_over}
         if self._truths_not_finite:
             self._figures["truths not finite"] = self._truths_not_finite
-        found = []
-        for i, j in pairs:
-            estimate, covariance = self._estimates[i]
-            found.append((estimate.stamp, pose_error(estimate, self._truths[j]), covariance))
+        found = [(estimate.stamp, pose_error(estimate, truth), C) for (estimate, C), truth in pairs]
         parts = (
             {"pose": [0, 1, 5], "position": [0, 1], "heading": [5]}
             if self.planar

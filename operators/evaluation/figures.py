@@ -45,8 +45,3 @@ def check_names(found: tuple[str, ...], truth: tuple[str, ...]) -> None:
             f"the {named} names its classes ({', '.join((truth or found)[:5])} ...) but the {nameless} has no "
             f"class_names: classes are matched by name, so both must have names, or neither"
         )
-
-
-def listed(names: set[str]) -> str:
-    """Names in one line of a summary."""
-    return ", ".join(sorted(names))

@@ -12,7 +12,7 @@ import numpy as np
 
 from dataflow.messages import SegmentationMap
 from dataflow.operator import Batch, Duration, In, Operator, Param
-from operators.evaluation.figures import Figures, check_names, check_view, listed
+from operators.evaluation.figures import Figures, check_names, check_view
 from operators.evaluation.pairing import Pairing
 from operators.segmentation.score import Confusion, class_iou
 
@@ -98,7 +98,7 @@ class SegmentationMetrics(Figures, Operator):
         }
         unknown = set(classes) - self._known
         if self._known and unknown:
-            figures["unknown_classes"] = listed(unknown)
+            figures["unknown_classes"] = ", ".join(sorted(unknown))
             if len(unknown) < len(classes):
                 figures["miou_known_classes"] = float(
                     np.mean([classes[name] for name in classes if name not in unknown])

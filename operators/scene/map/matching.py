@@ -15,6 +15,7 @@ from operators.scene.map.voxels import VoxelSet, standing_box
 from operators.tracking.assignment import overlap
 
 Array = NDArray[np.float64]
+Pair = tuple[float, float]
 LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so that its voxels tell
 _COARSE = 0.3  # metres from which a thing is often hidden in part
 _WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
@@ -78,38 +79,32 @@ def alike_mover(each: Observation, voxels: VoxelSet, object: MapObject, stamp: i
     return near + (_TRACKED if each.track in object.tracks else 0.0) if near > 0 else 0.0
 
 
-@dataclass(frozen=True)
-class InImage:
-    """An observation's image and that of an object's box: IoU, and the share of the first that is in the second."""
-
-    iou: float
-    within: float
-
-
 def alike(
-    each: Observation, voxels: VoxelSet, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
+    each: Observation, voxels: VoxelSet, object: MapObject, image: Pair | None, s: MapSettings, *, large: bool
 ) -> float:
     """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
-    `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
+    `image` has the IoU of its image with that of the object's box, and the share of the first that is in the second,
+    where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
+    iou, within = (math.nan, math.nan) if image is None else image
     away = outside(voxels.middle, object.box)
     reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(voxels.middle - each.image.eye))
     if away > reach:
         return 0.0
     if each.class_id != object.class_id:
         if image is not None:
-            return 0.5 * image.iou if image.iou >= 0.6 else 0.0
+            return 0.5 * iou if iou >= 0.6 else 0.0
         if float(np.abs(object.size - voxels.extent).max()) > 0.5 * float(object.size.max()):
             return 0.0
         share = min(object.voxels.near(voxels.points, s.voxel), voxels.near(object.voxels.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
     value += _TRACKED if each.track in object.tracks else 0.0
-    if image is not None and image.iou >= s.image_overlap:
-        return value + 0.6 * image.iou
+    if iou >= s.image_overlap:
+        return value + 0.6 * iou
     if image is not None and not large:  # what is hidden in part shows in part of its box
-        return value + 0.2 * image.within if image.within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
+        return value + 0.2 * within if within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
     share = object.voxels.near(voxels.points, tolerance(voxels.extent))
     if image is None and not large:
         value *= closeness(voxels, object.voxels)
@@ -131,20 +126,9 @@ def in_reach(seen: Sequence[Observation], voxels: Sequence[VoxelSet], rows: Arra
     return np.asarray((gaps * gaps).sum(axis=0) <= np.square(reach + 1e-6)[:, None])
 
 
-@dataclass(frozen=True, eq=False)
-class InImages:
-    """The same of each observation (N) and object (M): `iou` and `within` (N, M)."""
-
-    iou: Array
-    within: Array
-
-    def of(self, observation: int, object: int) -> InImage:
-        """Compares one of each."""
-        return InImage(float(self.iou[observation, object]), float(self.within[observation, object]))
-
-
-def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
-    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any."""
+def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> Array | None:
+    """Returns the IoUs of the images of observations (N) and boxes (M, 7), some of round things, and the shares of the
+    first in the second (N, M, 2); None without images."""
     if not len(rows) or any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
@@ -159,7 +143,7 @@ def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
     areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)
     within = np.nan_to_num(np.maximum(high - low, 0).prod(axis=2) / areas[:, None])
-    return InImages(iou, within)
+    return np.stack([iou, within], axis=2)
 
 
 def in_places_of_their_own(images: Sequence[ImageView]) -> NDArray[np.bool_]:

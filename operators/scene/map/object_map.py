@@ -159,7 +159,7 @@ class ObjectMap:
         near_by = [known[j] for j in compared]
         images = in_image(seen, boxes, np.array([self._priors.is_round(o) for o in near_by], bool))
         for k, n in np.argwhere(here[:, compared] & in_reach(seen, voxels, boxes, s)).tolist():
-            j, image = compared[n], None if images is None else images.of(k, n)
+            j, image = compared[n], None if images is None else (float(images[k, n, 0]), float(images[k, n, 1]))
             value[k, j] = alike(seen[k], voxels[k], known[j], image, s, large=self._priors.is_large(known[j]))
         left: dict[int, bool] = {}
         for k in np.flatnonzero(movers).tolist():

@@ -117,12 +117,10 @@ class SurfaceMap:
         others = [s for i, s in self.surfaces.items() if i not in shown and s.label != FLOOR]
         sights = view.of_each([s.voxels.points for s in others], _MARGIN)
         for surface, sight in zip(others, sights, strict=True):
-            looked = int(np.count_nonzero(sight.looked))
-            if looked < max(5, 0.2 * len(sight.looked)):
+            if int(np.count_nonzero(sight.looked)) < sight.least:
                 continue
-            vacated = int(np.count_nonzero(sight.free)) >= 0.6 * looked
             surface.voxels.carve(sight.free)
-            if vacated:
+            if sight.is_empty:
                 surface.evidence -= _VACATED
             if len(surface.voxels) < _LEFT * surface.most:
                 surface.evidence = -1.0
