@@ -24,7 +24,7 @@ from dataflow.messages import SceneGraph
 from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.scene import SceneGraphBuilder
-from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.bodies import shared_volume, upright_iou
 from operators.scene.map.voxels import VoxelSet
 from operators.scene.scoring import Box, boxes_of, match_nodes
 from operators.simulator.worlds.make import make_world

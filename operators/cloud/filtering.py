@@ -19,7 +19,7 @@ _LIMIT = 1 << 20  # voxels along one axis on either side of the origin; three su
 
 
 FIELDS = ("colors", "intensities", "rings", "time_offsets", "normals", "precise")
-"""What a cloud may hold of each point beside its place."""
+"""Fields of a cloud that hold a value for each point, beside its place."""
 
 
 def selected(cloud: PointCloud, chosen: Mask, *, fields: Sequence[str] = FIELDS) -> PointCloud:

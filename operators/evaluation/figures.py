@@ -1,4 +1,4 @@
-"""What operators that score have in common: figures, when they begin anew, and what they can compare."""
+"""Figures of operators that score, when they begin anew, and checks of what they can compare."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from operators.learning.balance import class_weights
 from operators.learning.export import export_steps
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import NAMES
-from operators.recognition.activity.model import KIND
+from operators.recognition.activity.recognizer import KIND
 from operators.recognition.activity.samples import (
     LAG,
     Track,

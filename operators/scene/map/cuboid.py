@@ -114,7 +114,7 @@ class _Ways:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What boxes are compared with: the image boxes (V, 4) of views `P` (3, V, 4) with weights, and points.
+    """Evidence for a box: the image boxes (V, 4) of views `P` (3, V, 4) with their weights, and points.
 
     `places` (3, N) are `count` points, then the eyes; `cut`, `noise` and `inset` as `_surface` takes them.
     """

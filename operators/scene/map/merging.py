@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.box_overlap import shared_volume
+from operators.scene.bodies import shared_volume
 from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.map.matching import MapSettings, closeness, tolerance

@@ -74,14 +74,10 @@ def test_frames_that_differ_are_named() -> None:
 def test_innovations_of_a_filter_are_judged_by_sensor(noise: float, word: str) -> None:
     total = float(np.square(np.random.default_rng(0).normal(0, noise, 300)).sum())
     status = Diagnostics(
-        stamp=SECOND,
-        names=("filter", "robot/fix", "robot/silent"),
-        messages=("", "", ""),
-        levels=np.zeros(3, np.uint8),
-        keys=("nis", "freedom", "nis", "freedom"),
-        values=(f"{total:.3f}", "300", "0.000", "0"),
-        owners=np.array([1, 1, 2, 2], np.int32),
-    )
+        stamp=SECOND, names=("filter", "robot/fix", "robot/silent"), messages=("", "", ""),
+        levels=np.zeros(3, np.uint8), keys=("nis", "freedom", "nis", "freedom"),
+        values=(f"{total:.3f}", "300", "0.000", "0"), owners=np.array([1, 1, 2, 2], np.int32),
+    )  # fmt: skip
     pose = Pose(stamp=2 * SECOND, frame="world", position=[0, 0, 0], orientation=[0, 0, 0, 1], covariance=np.eye(6))
     operator = ConsistencyMetrics()
     play(operator, {"estimate": [pose], "ground_truth": [pose], "status": [status]})

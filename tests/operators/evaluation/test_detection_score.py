@@ -29,13 +29,10 @@ def frame(rng: np.random.Generator) -> ScoredFrame:
     moved = truth[rng.integers(0, count, 6)] + rng.normal(0, 3, (6, 4)) if count else np.zeros((0, 4))
     moved[:, 2:] = np.maximum(moved[:, 2:], moved[:, :2] + 1)
     return ScoredFrame(
-        truth,
-        tuple(labels),
-        rng.random(count) < 0.3,
-        moved,
+        truth, tuple(labels), rng.random(count) < 0.3, moved,
         tuple(rng.choice([*labels, *NAMES], len(moved)).tolist()),
         rng.integers(1, 10, len(moved)).astype(np.float32) / np.float32(10),
-    )
+    )  # fmt: skip
 
 
 def by_one_evaluation(frames: Sequence[ScoredFrame], most: int, name: str) -> tuple[float | None, float | None]:

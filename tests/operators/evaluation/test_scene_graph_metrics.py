@@ -31,18 +31,11 @@ def graph(stamp: int, nodes: list[Thing], relations: list[tuple[int, str, int]],
 
 def seen(stamp: int, ids: list[int], visible: float = 1.0) -> Detections2D:
     return Detections2D(
-        stamp=stamp,
-        frame="camera",
-        width=640,
-        height=480,
-        class_names=CLASSES,
-        boxes=np.tile([10.0, 10, 50, 50], (len(ids), 1)),
-        scores=np.ones(len(ids), np.float32),
-        class_ids=np.zeros(len(ids), np.int32),
-        ids=np.array(ids, np.int64),
-        visible=np.full(len(ids), visible, np.float32),
-        pixel_counts=np.full(len(ids), 900, np.int64),
-    )
+        stamp=stamp, frame="camera", width=640, height=480, class_names=CLASSES,
+        boxes=np.tile([10.0, 10, 50, 50], (len(ids), 1)), scores=np.ones(len(ids), np.float32),
+        class_ids=np.zeros(len(ids), np.int32), ids=np.array(ids, np.int64),
+        visible=np.full(len(ids), visible, np.float32), pixel_counts=np.full(len(ids), 900, np.int64),
+    )  # fmt: skip
 
 
 def robot(stamp: int, frame: str, x: float) -> Odometry:

@@ -34,15 +34,11 @@ def statuses(count: int) -> list[Diagnostics]:
         total += 30.0 * (4.0 if k >= count // 2 else 1.0)
         made.append(
             Diagnostics(
-                stamp=(k + 1) * 10 * STEP,
-                names=("filter", "gnss/fix"),
-                messages=("", ""),
-                levels=np.zeros(2, np.uint8),
-                keys=("used", "nis", "freedom"),
-                values=("1", f"{total:.3f}", str(30 * (k + 1))),
-                owners=np.array([0, 1, 1], np.int32),
+                stamp=(k + 1) * 10 * STEP, names=("filter", "gnss/fix"), messages=("", ""),
+                levels=np.zeros(2, np.uint8), keys=("used", "nis", "freedom"),
+                values=("1", f"{total:.3f}", str(30 * (k + 1))), owners=np.array([0, 1, 1], np.int32),
             )
-        )
+        )  # fmt: skip
     return made
 
 

@@ -81,18 +81,11 @@ def test_what_is_mapped_scores_by_itself() -> None:
 
 def in_image(second: int, ids: list[int]) -> Detections2D:
     return Detections2D(
-        stamp=second * 1_000_000_000,
-        frame="camera",
-        width=100,
-        height=100,
-        class_names=("thing",),
-        boxes=np.tile(np.array([0, 0, 50, 50], np.float32), (len(ids), 1)),
-        scores=np.ones(len(ids), np.float32),
-        class_ids=np.zeros(len(ids), np.int32),
-        ids=np.array(ids, np.int64),
-        visible=np.ones(len(ids), np.float32),
+        stamp=second * 1_000_000_000, frame="camera", width=100, height=100, class_names=("thing",),
+        boxes=np.tile(np.array([0, 0, 50, 50], np.float32), (len(ids), 1)), scores=np.ones(len(ids), np.float32),
+        class_ids=np.zeros(len(ids), np.int32), ids=np.array(ids, np.int64), visible=np.ones(len(ids), np.float32),
         pixel_counts=np.full(len(ids), 2500, np.int64),
-    )
+    )  # fmt: skip
 
 
 def test_a_map_must_have_what_was_plainly_seen_by_then_and_movers_while_they_are_in_view() -> None:

@@ -24,13 +24,10 @@ def image(k: int, rows: Sequence[Sequence[float]], classes: Sequence[int] | None
     """Detections of frame k: rows of (x1, y1, x2, y2, score)."""
     table = np.array(rows, np.float64).reshape(-1, 5)
     return Detections2D(
-        stamp=(k + 1) * FRAME,
-        **{"frame": "camera", "width": 640, "height": 480} | more,
-        class_names=("person", "mug"),
-        boxes=table[:, :4],
-        scores=table[:, 4].astype(np.float32),
+        stamp=(k + 1) * FRAME, **{"frame": "camera", "width": 640, "height": 480} | more,
+        class_names=("person", "mug"), boxes=table[:, :4], scores=table[:, 4].astype(np.float32),
         class_ids=np.array(classes if classes is not None else [0] * len(table), np.int32),
-    )
+    )  # fmt: skip
 
 
 def walker(x: float, score: float = 0.9) -> list[float]:

@@ -22,15 +22,11 @@ def boxes(k: int, centers: Any, yaws: Any = 0.0, score: float = 0.9, sizes: Any 
     points = np.array(centers, np.float64).reshape(-1, 3)
     count = len(points)
     return Boxes3D(
-        stamp=(k + 1) * FRAME,
-        frame="world",
-        class_names=("person",),
-        centers=points,
+        stamp=(k + 1) * FRAME, frame="world", class_names=("person",), centers=points,
         sizes=np.broadcast_to(np.array(sizes, np.float64), (count, 3)),
         orientations=quaternion_from_yaw(np.broadcast_to(np.array(yaws, np.float64), (count,))).reshape(-1, 4),
-        scores=np.full(count, score, np.float32),
-        class_ids=np.zeros(count, np.int32),
-    )
+        scores=np.full(count, score, np.float32), class_ids=np.zeros(count, np.int32),
+    )  # fmt: skip
 
 
 def tracked(given: Sequence[Boxes3D], **params: Any) -> list[Tracks]:

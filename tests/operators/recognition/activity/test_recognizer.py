@@ -92,17 +92,10 @@ def test_balls_roll_and_rest_robots_drive_and_rest() -> None:
 def test_a_robot_that_drives_into_view_drives_at_once_by_boxes_of_the_same_time(later: float, expected: str) -> None:
     (graph,) = course(0.25, lambda _: [(3, "robot", (0.0, 4.0, 0.0), (0.4, 0.4, 0.4))])
     boxes = Boxes3D(
-        stamp=graph.stamp + round(later * 1e9),
-        frame=graph.frame,
-        class_names=graph.class_names,
-        centers=graph.positions,
-        sizes=graph.sizes,
-        orientations=graph.orientations,
-        scores=[0.9],
-        class_ids=graph.class_ids,
-        ids=graph.ids,
-        velocities=[(0.25, 0.0, 0.0)],
-    )
+        stamp=graph.stamp + round(later * 1e9), frame=graph.frame, class_names=graph.class_names,
+        centers=graph.positions, sizes=graph.sizes, orientations=graph.orientations, scores=[0.9],
+        class_ids=graph.class_ids, ids=graph.ids, velocities=[(0.25, 0.0, 0.0)],
+    )  # fmt: skip
     recognizer = Recognizer()
     recognizer.setup()
     assert said(recognizer.process(graph, objects=boxes), 3) == expected

@@ -33,16 +33,9 @@ def seen(body: dict[str, tuple[float, float]], facing: float, pitch: float, roll
 def message(*people: NDArray[np.float32], scores: float = 0.9) -> Keypoints2D:
     points = np.stack(people)
     return Keypoints2D(
-        stamp=5,
-        frame="camera",
-        width=640,
-        height=480,
-        names=COCO_KEYPOINTS,
-        links=np.array(COCO_LINKS, np.int32),
-        points=points,
-        scores=np.full(points.shape[:2], scores, np.float32),
-        ids=np.arange(len(points)) + 30,
-    )
+        stamp=5, frame="camera", width=640, height=480, names=COCO_KEYPOINTS, links=np.array(COCO_LINKS, np.int32),
+        points=points, scores=np.full(points.shape[:2], scores, np.float32), ids=np.arange(len(points)) + 30,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("pitch", [0.0, 15.0])

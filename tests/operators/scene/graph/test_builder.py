@@ -192,12 +192,9 @@ def test_what_a_hand_has_is_held() -> None:
 def recognised(stamp: int, name: str) -> Activity:
     """What a recogniser says of the person with id 9."""
     return Activity(
-        stamp=stamp,
-        class_names=(name,),
-        subjects=np.array([9]),
-        class_ids=np.array([0], np.int32),
+        stamp=stamp, class_names=(name,), subjects=np.array([9]), class_ids=np.array([0], np.int32),
         scores=np.array([0.7], np.float32),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("said", ["drinking", "unknown"])

@@ -31,12 +31,9 @@ def graph(second: int, mug: Sequence[float] | None, *relations: tuple[str, str, 
 
 def act(second: int, activity: str) -> Activity:
     return Activity(
-        stamp=second * SECOND,
-        class_names=("walking", "drinking"),
-        subjects=np.array([4], np.int64),
-        class_ids=np.array([("walking", "drinking").index(activity)], np.int32),
-        scores=np.array([0.9], np.float32),
-    )
+        stamp=second * SECOND, class_names=("walking", "drinking"), subjects=np.array([4], np.int64),
+        class_ids=np.array([("walking", "drinking").index(activity)], np.int32), scores=np.array([0.9], np.float32),
+    )  # fmt: skip
 
 
 GRAPHS = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.labels import LabelSpace, labels_file
-from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.bodies import shared_volume, upright_iou
 from operators.scene.map.cuboid import Box, ImageView, _surface, fit_cuboid, image_boxes, images
 from operators.scene.map.voxels import standing_box
 

@@ -15,7 +15,7 @@ from dataflow.messages import Boxes3D, Message, Path, Pose
 from dataflow.messages.geometry import matrix_to_quaternion, yaw_of
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter, SemanticMap
-from operators.scene.box_overlap import upright_iou
+from operators.scene.bodies import upright_iou
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 pytestmark = pytest.mark.long

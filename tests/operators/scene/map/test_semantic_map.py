@@ -18,7 +18,7 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play
 from operators.labels import SizePrior
 from operators.scene import ObjectLifter, SemanticMap
-from operators.scene.box_overlap import upright_iou
+from operators.scene.bodies import upright_iou
 from operators.scene.map.map_object import completed
 
 SECOND = 1_000_000_000
