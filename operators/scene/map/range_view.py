@@ -30,12 +30,12 @@ class Sight:
 
     @property
     def least(self) -> float:
-        """How many places must be looked at for a view to tell."""
+        """Least number of places looked at from which a view tells."""
         return max(5.0, 0.2 * len(self.looked))
 
     @property
     def is_empty(self) -> bool:
-        """Whether enough places are looked at, and most of these are seen through."""
+        """True where enough places are looked at and most of these are seen through."""
         looked = int(np.count_nonzero(self.looked))
         return looked >= self.least and int(np.count_nonzero(self.free)) >= EMPTY * looked
 
