@@ -30,7 +30,7 @@ class Sight:
 
     @property
     def least(self) -> float:
-        """Least number of places looked at from which a view tells."""
+        """Least number of places looked at from which a view decides."""
         return max(5.0, 0.2 * len(self.looked))
 
     @property
