@@ -292,31 +292,30 @@ def test_orientation_turns_a_footprint() -> None:
     np.testing.assert_allclose(graph.sizes[floor, :2], [0.8, 1.5], atol=1e-9)
 
 
-def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves() -> None:
+@pytest.mark.parametrize(("moving", "said"), [(0.05, "resting"), (0.5, "unknown"), (0.95, "driving")])
+def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves(moving: float, said: str) -> None:
     seen = [room(k, [(2, "car", (8 + 0.3 * k, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(8)]
-    acts = {}
-    for sure in (0.05, 0.5, 0.95):
-        nodes = [each.replace(moving=np.array([sure, np.nan], np.float32)) for each in seen]
-        played = play(SceneGraphBuilder(), {"nodes": nodes})
-        graph, act = played["graph"][-1], played["activities"][-1]
-        assert graph.moving[graph.names().index("car 2")] == np.float32(sure)
-        acts[sure] = doing(act)
-    assert acts == {0.05: "resting", 0.5: "unknown", 0.95: "driving"}
+    graph, act = driven(seen, moving)
+    assert (doing(act), graph) == (said, np.float32(moving))
 
 
 @pytest.mark.parametrize(("moving", "ago", "said"), [(0.98, 1, "driving"), (0.98, 2, "unknown"), (0.02, 2, "resting")])
 def test_a_vehicle_out_of_sight_may_have_stopped(moving: float, ago: float, said: str) -> None:
+    graph, act = driven(
+        [room(k, [(2, "car", (8, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(4)], moving, ago=round(ago * 1e9)
+    )
+    assert (doing(act), graph) == (said, np.float32(0.5 if said == "unknown" else moving))
+
+
+def driven(seen: Sequence[SceneGraph], moving: float, ago: int = 0) -> tuple[np.float32, Activity]:
+    """Whether car 2 moves at the end, and what it does; its node moves with `moving` and was seen `ago`."""
     nodes = [
-        room(k, [(2, "car", (8, 3, 0.7), (4, 1.8, 1.5)), TABLE]).replace(
-            moving=np.array([moving, np.nan], np.float32), last_seen=np.array([(k + 1) * STEP - round(ago * 1e9)] * 2)
-        )
-        for k in range(4)
+        each.replace(moving=np.array([moving, np.nan], np.float32), last_seen=np.array([each.stamp - ago] * 2))
+        for each in seen
     ]
     played = play(SceneGraphBuilder(), {"nodes": nodes})
-    graph, act = played["graph"][-1], played["activities"][-1]
-    assert doing(act) == said
-    unsure = said == "unknown"
-    assert graph.moving[graph.names().index("car 2")] == np.float32(0.5 if unsure else moving)
+    graph = played["graph"][-1]
+    return graph.moving[graph.names().index("car 2")], played["activities"][-1]
 
 
 @pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
@@ -330,30 +329,27 @@ def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(mov
     np.testing.assert_allclose(velocity, [speed, 0, 0], atol=1e-9)
 
 
-def test_postures_without_ids_are_of_no_node() -> None:
-    sitting = Classification(
-        stamp=STEP, class_names=("sitting",), class_ids=np.array([0], np.int32), scores=np.array([0.9], np.float32)
-    )
-    act = play(Builder(), {"nodes": [room(0, [person(4, 2, id=1)])], "postures": [sitting]})["activities"][0]
-    assert doing(act) == "unknown"
-
-
-def test_joints_decide_between_sitting_and_standing_and_without_them_it_is_unknown() -> None:
-    def said(*rows: tuple[int, str, float]) -> list[tuple[str, float]]:
-        names = ("standing", "sitting")
-        joints = [
-            Classification(
-                stamp=(k + 1) * STEP,
-                class_names=names,
-                class_ids=np.array([names.index(name) for _, name, _ in rows], np.int32),
-                scores=np.array([score for _, _, score in rows], np.float32),
-                ids=np.array([i for i, _, _ in rows], np.int64),
-            )
-            for k in range(5)
-        ]
-        nodes = [room(k, [person(4, 2, id=8), person(6, -2, id=9)]) for k in range(5)]
-        act = play(Builder(), {"nodes": nodes, "postures": joints})["activities"][-1]
-        return [(act.class_names[c], round(float(s), 2)) for c, s in zip(act.class_ids, act.scores, strict=True)]
-
-    assert said((8, "sitting", 0.8), (9, "standing", 0.9)) == [("sitting", 0.8), ("standing", 0.9)]
-    assert said((9, "sitting", 0.7)) == [("unknown", 0.3), ("sitting", 0.7)]
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ([(8, "sitting", 0.8), (9, "standing", 0.9)], [("sitting", 0.8), ("standing", 0.9)]),
+        ([(9, "sitting", 0.7)], [("unknown", 0.3), ("sitting", 0.7)]),
+        ([(None, "sitting", 0.9)], [("unknown", 0.3), ("unknown", 0.3)]),  # without ids they are of no node
+    ],
+)
+def test_joints_decide_between_sitting_and_standing_and_without_them_it_is_unknown(
+    rows: list[tuple[Any, str, float]], expected: list[tuple[str, float]]
+) -> None:
+    names, ids = ("standing", "sitting"), [id for id, _, _ in rows]
+    joints = [
+        Classification(
+            stamp=(k + 1) * STEP, class_names=names, scores=np.array([score for _, _, score in rows], np.float32),
+            class_ids=np.array([names.index(name) for _, name, _ in rows], np.int32), ids=None if None in ids else ids,
+        )
+        for k in range(5)
+    ]  # fmt: skip
+    nodes = [room(k, [person(4, 2, id=8), person(6, -2, id=9)]) for k in range(5)]
+    act = play(Builder(), {"nodes": nodes, "postures": joints})["activities"][-1]
+    assert [
+        (act.class_names[c], round(float(s), 2)) for c, s in zip(act.class_ids, act.scores, strict=True)
+    ] == expected
