@@ -14,11 +14,16 @@ from operators.cloud import CameraMount, camera_mount
 from operators.cloud.vertical import Vertical
 from operators.geometry.extrinsics import transform_between
 
-NOTHING = np.zeros((0, 3))
-
 
 def cloud(points: Array, stamp: int = 0) -> PointCloud:
     return PointCloud(stamp=stamp, frame="depth", points=points.astype(np.float32))
+
+
+def mounted(down: float, roll: float = 0) -> Transforms:
+    """The extrinsics of an optical frame on a level base that looks down and is rolled, degrees."""
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ turned(down, 0).T @ turned(0, roll).T
+    return Transforms.from_matrix(T, stamp=0, frame="base_link", child_frame="depth")
 
 
 def related(parent: str, child: str, x: float = 0.0, stamp: int = 0) -> Transforms:
@@ -27,6 +32,8 @@ def related(parent: str, child: str, x: float = 0.0, stamp: int = 0) -> Transfor
     return Transforms.from_matrix(T, stamp=stamp, frame=parent, child_frame=child)
 
 
+NOTHING = np.zeros((0, 3))
+EMPTY = [cloud(NOTHING, stamp * 1_000_000_000) for stamp in range(4)]
 COLOR, GIVEN = related("depth", "color"), related("base_link", "depth")
 
 
@@ -49,8 +56,7 @@ def test_a_view_that_decides_later_counts_from_where_the_odometry_began() -> Non
     T[:3, :3] = first @ later.T
     T[:3, 3] = first @ [0, -0.2, 0]  # 0.2 m higher by now
     moved = Odometry.from_matrix(T, stamp=1, frame="odom", child_frame="depth")
-    nothing = cloud(np.zeros((0, 3)))
-    streams = {"cloud": [nothing, cloud(room(10, 0), 1)], "motion": [moved]}
+    streams = {"cloud": [cloud(NOTHING), cloud(room(10, 0), 1)], "motion": [moved]}
     (made,) = play(CameraMount(), streams)["base_extrinsics"]
     assert made.stamp == 1
     T_base_camera = made.matrix("depth")
@@ -59,8 +65,7 @@ def test_a_view_that_decides_later_counts_from_where_the_odometry_began() -> Non
 
 
 def test_after_a_while_without_surfaces_a_guess_is_taken_with_a_warning() -> None:
-    nothing = [cloud(np.zeros((0, 3)), stamp) for stamp in (0, 1_000_000_000, 2_000_000_000)]
-    played = play(CameraMount(patience="2s"), {"cloud": nothing})
+    played = play(CameraMount(patience="2s"), {"cloud": EMPTY[:3]})
     assert [m.stamp for m in played["base_extrinsics"]] == [2_000_000_000]
     assert played["status"][0].levels.tolist() == [Level.WARN]
 
@@ -75,10 +80,9 @@ def test_a_base_that_is_given_is_kept_and_passed_on_when_it_changes() -> None:
 
 @pytest.mark.parametrize(("down", "wrong"), [(0, True), (28, False), (33, False)])
 def test_a_given_base_is_compared_with_the_first_view_that_shows_the_vertical(down: float, wrong: bool) -> None:
-    given = Transforms.from_matrix(_mounted(down), stamp=0, frame="base_link", child_frame="depth")
     mount = CameraMount()
     clouds = [cloud(NOTHING), *(cloud(room(28, 0), stamp) for stamp in (1, 2))]
-    played = play(mount, {"cloud": clouds, "extrinsics": [given]})
+    played = play(mount, {"cloud": clouds, "extrinsics": [mounted(down)]})
     assert len(played["base_extrinsics"]) == 1
     (status,) = played["status"]
     assert (status.stamp, status.levels.tolist()) == (1, [Level.WARN if wrong else Level.OK])
@@ -89,27 +93,15 @@ def test_a_given_base_is_compared_with_the_first_view_that_shows_the_vertical(do
 
 @pytest.mark.parametrize(("roll", "perhaps"), [(0, False), (90, True), (180, True), (-90, True), (45, False)])
 def test_a_camera_that_is_given_as_on_its_side_or_upside_down_may_be_so(roll: float, perhaps: bool) -> None:
-    T = _mounted(0)
-    T[:3, :3] = T[:3, :3] @ turned(0, roll).T
     mount = CameraMount()
-    given = Transforms.from_matrix(T, stamp=0, frame="base_link", child_frame="depth")
-    play(mount, {"cloud": [cloud(room(0 if roll else 28, 0))], "extrinsics": [given]})
+    play(mount, {"cloud": [cloud(room(0 if roll else 28, 0))], "extrinsics": [mounted(0, roll)]})
     assert mount.finding()
     assert ("if it is not mounted on its side or upside down, the extrinsics are wrong" in mount.finding()) is perhaps
 
 
 def test_a_given_base_is_not_called_wrong_where_no_surface_shows_the_vertical() -> None:
-    given = Transforms.from_matrix(_mounted(0), stamp=0, frame="base_link", child_frame="depth")
-    nothing = [cloud(NOTHING, stamp) for stamp in (0, 1_000_000_000, 2_000_000_000, 3_000_000_000)]
-    (status,) = play(CameraMount(patience="2s"), {"cloud": nothing, "extrinsics": [given]})["status"]
+    (status,) = play(CameraMount(patience="2s"), {"cloud": EMPTY, "extrinsics": [mounted(0)]})["status"]
     assert (status.stamp, status.levels.tolist()) == (2_000_000_000, [Level.OK])
-
-
-def _mounted(down: float) -> Array:
-    """Returns the pose (4, 4), on a level base, of an optical frame that looks down, degrees."""
-    T = np.eye(4)
-    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ turned(down, 0).T
-    return T
 
 
 def test_imu_of_a_frame_that_is_not_related_is_an_error() -> None:

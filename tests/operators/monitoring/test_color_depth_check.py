@@ -17,7 +17,7 @@ from dataflow.messages.diagnostics import Level
 from operators.geometry.extrinsics import transform_between
 from operators.monitoring import ColorDepthCheck
 from operators.monitoring.edge_alignment import EdgeAlignment, rims
-from tests.operators.monitoring.rooms import K, extrinsics, info, views
+from tests.operators.monitoring.rooms import K, extrinsics, info, views, warnings
 
 
 @cache
@@ -30,10 +30,6 @@ def checked(known: Transforms) -> Played:
     images, depths = pairs()
     infos = {"image_info": [info("color")], "depth_info": [info("depth")], "extrinsics": [known]}
     return play(ColorDepthCheck(period="200ms"), {"image": images, "depth": depths} | infos, static=list(infos))
-
-
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
 
 
 def test_cameras_that_fit_raise_no_alarm() -> None:

@@ -10,11 +10,10 @@ from repeated import assert_repeats
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Odometry, PointCloud, Transforms
-from dataflow.messages.diagnostics import Level
 from operators.geometry.se3 import exp
 from operators.monitoring import DepthScanCheck
 from operators.monitoring.depth_scan import DepthScanAgreement
-from tests.operators.monitoring.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views
+from tests.operators.monitoring.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views, warnings
 
 
 @cache
@@ -27,10 +26,6 @@ def checked(known: Transforms, scale: float = 1.0) -> Played:
     clouds, depths = pairs(scale)
     given = {"cloud": clouds, "depth": depths, "depth_info": [info("depth")], "extrinsics": [known]}
     return play(DepthScanCheck(), given, static=["depth_info", "extrinsics"])
-
-
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
 
 
 def test_sensors_that_fit_raise_no_alarm() -> None:

@@ -17,6 +17,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from operators.geometry.se3 import exp
 from operators.monitoring import MotionCheck
+from tests.operators.monitoring.rooms import warnings
 
 SECONDS = 12
 SPEED, TURN = 0.5, 0.4
@@ -49,15 +50,9 @@ def wheels(scale: float = 1.0, still: Sequence[float] = (99, 99)) -> list[Odomet
     for k in range(0, SECONDS * 100, 5):
         moves = not still[0] <= k / 100 < still[1]
         linear, angular = np.array([SPEED, 0, 0]), np.array([0, 0, TURN * np.sin(0.008 * (k - 2.5))])
+        twist = {"linear": linear * scale * moves, "angular": angular * scale * moves}
         out.append(
-            Odometry.from_matrix(
-                np.eye(4),
-                stamp=k * 10_000_000,
-                frame="wheel_odom",
-                child_frame="base_link",
-                linear=linear * scale * moves,
-                angular=angular * scale * moves,
-            )
+            Odometry.from_matrix(np.eye(4), stamp=k * 10_000_000, frame="wheel_odom", child_frame="base_link", **twist)
         )
     return out
 
@@ -101,10 +96,6 @@ def checked(known: Transforms | None = None, operator: MotionCheck | None = None
     return play(operator or MotionCheck(), given, static=["extrinsics"])
 
 
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
-
-
 def test_sensors_that_agree_raise_no_alarm_and_wheels_pass_as_they_are() -> None:
     played = checked()
     assert warnings(played) == []
@@ -112,10 +103,18 @@ def test_sensors_that_agree_raise_no_alarm_and_wheels_pass_as_they_are() -> None
     assert [m.digest() for m in played["checked"]] == [m.digest() for m in wheels()]
 
 
-def test_wheels_of_another_radius_are_named_and_held_back() -> None:
-    played = checked(wheels=wheels(1.05))
-    assert warnings(played)[-1].startswith("wheels: 4.9% more way than")
-    assert len(played["checked"]) < 0.5 * len(wheels())
+@pytest.mark.parametrize(
+    ("name", "changed", "said"),
+    [
+        ("wheels", wheels(1.05), "wheels: 4.9% more way than motions/camera and motions/lidar"),
+        ("camera", odometry("camera", 10, 1, 1.05), "motions/camera: 4.9% more way than motions/lidar and wheels"),
+        ("imu", gyroscope(1.06), "gyroscope of imu: 5.8% more turning than"),
+    ],
+)
+def test_sensor_of_another_scale_is_reported_and_wheels_are_held_back(name: str, changed: Any, said: str) -> None:
+    played = checked(**{name: changed})
+    assert warnings(played)[-1].startswith(said)
+    assert (len(played["checked"]) < 0.5 * len(wheels())) == (name == "wheels")
 
 
 def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once_and_only_then() -> None:
@@ -127,12 +126,6 @@ def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once
     assert {m.stamp * 1e-9 for m in given if not 4.0 <= m.stamp * 1e-9 < 6.3} <= passed
     assert any("otherwise than the robot moves" in text for text in warnings(played))
     assert int(played["status"][-1].levels[0]) == Level.OK
-
-
-def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
-    said = warnings(checked(camera=odometry("camera", 10, 1, scale=1.05)))
-    assert said[-1].startswith("motions/camera: 4.9% more way than")
-    assert "motions/lidar and wheels" in said[-1]
 
 
 @pytest.mark.parametrize("sensor", [pytest.param("wheels", marks=pytest.mark.long), "imu"])
@@ -148,11 +141,6 @@ def test_sensor_that_repeats_a_reading_of_motion_is_reported_and_one_at_rest_is_
         m.replace(position=np.zeros(3), orientation=np.array([0, 0, 0, 1.0])) for m in odometry("camera", 10, 1)
     ]
     assert not warnings(checked(wheels=resting, camera=standing, lidar=[], imu=[]))
-
-
-def test_a_gyroscope_of_another_scale_is_named() -> None:
-    said = warnings(checked(imu=gyroscope(1.06)))
-    assert said[-1].startswith("gyroscope of imu: 5.8% more turning than")
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ SECOND = 1_000_000_000
 BALL_SIZE = {BALL: (SizePrior((0.12, 0.12, 0.12), (0.4, 0.4, 0.4), True),)}
 PERSON = SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), foot=1.0)
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+WALL = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 112)), axis=-1).reshape(-1, 3)
 Solid = tuple[Sequence[float], Sequence[float]]
 """Centre and full size of a box along the axes."""
 
@@ -55,14 +56,13 @@ def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] =
     known = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     for k, scene in enumerate(scenes):
         T = looking(0.4 * np.sin(k))
-        wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
-        hidden = np.zeros(len(wall), np.bool_)
-        way = wall - T[:3, 3]
+        hidden = np.zeros(len(WALL), np.bool_)
+        way = WALL - T[:3, 3]
         for solid, _ in scene:
             center, size = np.array(solid[0]), np.array(solid[1])
             at = T[:3, 3] + way * ((center[0] - T[0, 3]) / way[:, :1])
             hidden |= (np.abs(at - center)[:, 1:] < size[1:] / 2).all(axis=1)
-        points = np.concatenate([wall[~hidden], *(surface(solid) for solid, _ in scene)])
+        points = np.concatenate([WALL[~hidden], *(surface(solid) for solid, _ in scene)])
         seen = [observation(solid, class_id, T) for solid, class_id in scene]
         seen = [replace(each, track=track) for each, track in zip(seen, tracks or [-1] * len(seen), strict=True)]
         in_sensor = (points - T[:3, 3]) @ T[:3, :3]
@@ -71,6 +71,8 @@ def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] =
 
 
 THING: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.12))
+BESIDE: Solid = ((2.0, 0.13, 0.1), THING[1])
+NOTHING = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
 
 
 def only(known: ObjectMap) -> MapObject:
@@ -87,9 +89,8 @@ def watched(
     known: ObjectMap, views: Iterable[tuple[NDArray[np.float64], Sequence[Observation]]], *, behind: bool = False
 ) -> ObjectMap:
     """The map after views, a quarter of a second apart, that show things and, where asked, a wall behind them."""
-    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
     for T, seen in views:
-        points = np.concatenate([wall, *(each.points for each in seen)]) if behind else np.zeros((0, 3))
+        points = np.concatenate([WALL, *(each.points for each in seen)]) if behind else np.zeros((0, 3))
         stamp = SECOND // 4 + (known.snapshot()["stamp"] or 0)
         known.update(stamp, seen, RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
     return known
@@ -172,9 +173,8 @@ def test_a_merged_object_has_the_tracks_of_both_and_the_last_ones_are_kept() -> 
     assert MapObject.restored(both.snapshot(), 0.03).tracks == both.tracks
 
 
-def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:
-    lying = after([[(THING, BALL)]] * 6 + [[]] * 2)
-    assert only(lying).id == 1
+def test_ball_at_rest_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:
+    assert only(after([[(THING, BALL)]] * 6 + [[]] * 2)).id == 1
     moved = [[(((2.0, 0.08 * k, 0.1), THING[1]), BALL)] for k in range(1, 9)]
     object = only(after([[(THING, BALL)]] * 6 + moved))
     assert object.id == 1
@@ -193,10 +193,8 @@ def held(places: Sequence[Sequence[float]], *, portable: bool = True, behind: bo
     """The mugs of the map after one stood beside a person, then was at other places, with the person or without."""
     mug = SizePrior((0.1, 0.1, 0.1), (0.2, 0.2, 0.2), True)
     roles = {"movers": [BOX], "carriers": [BOX], "portable": [MUG] if portable else []}
-    known, T = (
-        mapping({BOX: (SizePrior((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0),), MUG: (mug,)}, **roles),
-        looking(0.0),
-    )
+    known = mapping({BOX: (SizePrior((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0),), MUG: (mug,)}, **roles)
+    T = looking(0.0)
     person = observation(((2.0, 0.0, 0.4), (0.4, 0.5, 1.6)), BOX, T)
     mugs = [observation((place, (0.1, 0.1, 0.1)), MUG, T) for place in [(1.7, 0.45, 0.1)] * 8 + list(places)]
     watched(known, [(T, [person, each]) for each in mugs], behind=behind)
@@ -237,8 +235,7 @@ def test_height_of_a_person_over_the_floor_decides_the_depth_of_the_box() -> Non
 
 @pytest.mark.parametrize("lacks", [(), ("beside",), ("told",)], ids=["", "without neighbours", "without times"])
 def test_a_snapshot_is_taken_up_also_from_before_something_was_counted(lacks: Sequence[str]) -> None:
-    beside: Solid = ((2.0, 0.13, 0.1), THING[1])
-    known = after([[(THING, BOX), (beside, MUG)]] * 5)
+    known = after([[(THING, BOX), (BESIDE, MUG)]] * 5)
     earlier = known.snapshot()
     for entry in earlier["objects"]:
         for name in lacks:
@@ -252,9 +249,7 @@ def test_a_snapshot_is_taken_up_also_from_before_something_was_counted(lacks: Se
 
 
 def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
-    beside: Solid = ((2.0, 0.13, 0.1), (0.12, 0.12, 0.12))
-    both = [[(THING, BOX), (beside, BOX)]] * 3
-
+    both = [[(THING, BOX), (BESIDE, BOX)]] * 3
     assert sum(len(o.beside) for o in after(both).objects.values()) == 2
     known = after([*both[:2], *[[(THING, BOX)]] * 10])
     assert len(known.objects) == 1
@@ -264,9 +259,9 @@ def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
 @pytest.mark.parametrize("rate", [10, 20, 50])
 def test_evidence_is_independent_of_the_rate_of_images(rate: int) -> None:
     known = mapping()
-    T, nothing = looking(0.0), RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
+    T = looking(0.0)
     for k in range(rate * 2 // 5 + 1):
-        known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], nothing)
+        known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], NOTHING)
     object = only(known)
     assert object.sightings == 5
     assert object.evidence == pytest.approx(5 * np.log(0.6 / 0.4))
@@ -275,18 +270,16 @@ def test_evidence_is_independent_of_the_rate_of_images(rate: int) -> None:
 @pytest.mark.parametrize(("seconds", "given"), [(0.1, 0), (0.3, 1)])
 def test_what_images_in_a_flash_show_is_not_yet_there(seconds: float, given: int) -> None:
     known = mapping()
-    nothing = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
     for k in range(4):
         stamp = SECOND + round(k * seconds / 3 * SECOND)
-        known.update(stamp, [observation(THING, BOX, looking(0.0))], nothing)
+        known.update(stamp, [observation(THING, BOX, looking(0.0))], NOTHING)
     assert len(known.confirmed()) == given
 
 
 @pytest.mark.parametrize("rate", [10, 50])
 def test_an_empty_place_is_given_up_as_soon_at_any_rate_of_images(rate: int) -> None:
     known, T = after([[(THING, BOX)]] * 8), looking(0.0)
-    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
-    empty = RangeView((wall - T[:3, 3]) @ T[:3, :3], T, 0.012)
+    empty = RangeView((WALL - T[:3, 3]) @ T[:3, :3], T, 0.012)
     only(known).voxels.hits[:] = 1000  # so that its voxels are not what goes first
     for k in range(1, 3 * rate + 1):
         known.update(2 * SECOND + k * SECOND // rate, [], empty)
