@@ -55,7 +55,7 @@ def test_the_shift_is_that_of_the_image() -> None:
     assert whole.off(3)
 
 
-def test_images_without_edges_say_nothing() -> None:
+def test_images_without_edges_give_no_shift() -> None:
     alignment = EdgeAlignment()
     _, depths = pairs()
     alignment.add(np.full((240, 320, 3), 90, np.uint8), K, rims(depths[0].data, K))

@@ -117,7 +117,7 @@ def test_sensor_of_another_scale_is_reported_and_wheels_are_held_back(name: str,
     assert (len(played["checked"]) < 0.5 * len(wheels())) == (name == "wheels")
 
 
-def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once_and_only_then() -> None:
+def test_wheels_at_rest_on_a_moving_robot_are_held_back_at_once_and_only_then() -> None:
     given = wheels(still=(4.0, 6.0))
     played = checked(wheels=given)
     late = [m.stamp * 1e-9 for m in given if 4.3 <= m.stamp * 1e-9 < 6.0]

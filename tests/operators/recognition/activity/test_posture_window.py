@@ -24,7 +24,7 @@ def test_looks_count_for_half_a_second() -> None:
     assert looks.evidence(1.0) is None
 
 
-def test_two_looks_that_contradict_each_other_say_nothing() -> None:
+def test_contradicting_postures_cancel() -> None:
     looks = PostureWindow()
     looks.update(0.0, probabilities(0.9, 0.1))
     looks.update(0.25, probabilities(0.1, 0.9))

@@ -101,7 +101,7 @@ def test_a_robot_that_drives_into_view_drives_at_once_by_boxes_of_the_same_time(
     assert said(recognizer.process(graph, objects=boxes), 3) == expected
 
 
-def test_who_is_out_of_sight_for_long_does_something_unknown() -> None:
+def test_activity_of_an_agent_out_of_sight_becomes_unknown() -> None:
     graphs = course(3, lambda t: [person(0.0, 0.0)])
     graphs += [nodes(t, [person(0.0, 0.0)], {1: 2.75}) for t in (3.5, 4.5, 5.5)]
     found = answers(graphs)

@@ -127,7 +127,7 @@ def test_ids_outlast_the_correction_and_boxes_lie_on_the_true_ones() -> None:
     assert max(overlaps(before)[-3:]) < 0.3
 
 
-def test_keyframes_that_say_what_the_map_has_already_move_nothing() -> None:
+def test_unchanged_keyframes_move_nothing() -> None:
     again = keyframes((LOOP + 2) * STEP)
     once, twice = mapped(keyframes((LOOP + 1) * STEP)), mapped(keyframes((LOOP + 1) * STEP), again)
     np.testing.assert_allclose(objects(twice).centers, objects(once).centers, atol=0.03)

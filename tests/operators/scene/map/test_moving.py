@@ -115,7 +115,7 @@ def test_voxels_that_are_added_later_are_of_no_moment_before() -> None:
     assert vehicle.moving == again.moving
 
 
-def test_the_places_of_a_car_of_a_few_voxels_say_nothing_and_its_centre_counts() -> None:
+def test_motion_of_a_car_of_few_voxels_is_that_of_its_centre() -> None:
     far = ((200, 0, 10), (1, 400, 30))
     car = judged(lambda t: ((90 + 10 * t, 3, 1), (4.5, 1.8, 1.5)), 0, 0, house=far)
     assert 0 < len(car.voxels) < 5
