@@ -17,11 +17,11 @@ _SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
 _ODD = 4.0  # spreads above the usual size, from which an object is doubted
 
 
-class Kinds:
+class ClassPriors:
     """Derives for objects and classes what follows from which classes move and which sizes are usual."""
 
     @classmethod
-    def of(cls, labels: LabelSpace, classes: Sequence[str]) -> Kinds:
+    def of(cls, labels: LabelSpace, classes: Sequence[str]) -> ClassPriors:
         """Returns what a label space has about the classes of a map, by their numbers."""
         movers, carriers, portable = (labels.indices(classes, role) for role in ("agent", "person", "portable"))
         usual = {k: labels.sizes(name) for k, name in enumerate(classes) if labels.sizes(name)}

@@ -1,6 +1,25 @@
-"""Checks that a result and its truth can be compared: same camera, same picture, classes matched by name."""
+"""Figures of operators that score, when they begin anew, and checks of what they can compare."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+class Figures:
+    """Gives the figures of a score at a run's end; a mixin for operators, whose `setup` begins it."""
+
+    _figures: dict[str, float | int | str]
+
+    def setup(self) -> None:
+        """Begins the score."""
+        self._figures = {}
+
+    def on_reset(self, input: str) -> None:
+        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        self.setup()
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        return dict(self._figures)
 
 
 def check_view(found: tuple[str, int, int], truth: tuple[str, int, int]) -> None:
@@ -26,8 +45,3 @@ def check_names(found: tuple[str, ...], truth: tuple[str, ...]) -> None:
             f"the {named} names its classes ({', '.join((truth or found)[:5])} ...) but the {nameless} has no "
             f"class_names: classes are matched by name, so both must have names, or neither"
         )
-
-
-def listed(names: set[str]) -> str:
-    """Names in one line of a summary."""
-    return ", ".join(sorted(names))

@@ -19,6 +19,7 @@ Keys = NDArray[np.int64]
 _HALF = 1 << 20
 _FEW = 4096  # pairs of places
 _LEAST = 20  # voxels that show where a thing is
+_COLUMNS = ("points", "hits", "free", "other", "times")
 _WEIGHTS = np.array([1 << 42, 1 << 21, 1], np.int64)
 
 
@@ -28,32 +29,36 @@ def keys_of(points: Array, side: float) -> Keys:
     return np.asarray((cell + _HALF) @ _WEIGHTS)
 
 
-class Cells:
+class VoxelSet:
     """A set of voxels with the mean of the points in each, and counts of views.
 
     `hits` are the views in which it was the object's, `other` those in which the object was seen and this surface too,
     as something else, `free` those that saw through it; `times` are the mean times of the hits, nanoseconds.
     """
 
-    def __init__(self, side: float) -> None:
+    def __init__(self, side: float, keys: Keys | None = None, points: Array | None = None, stamp: int = 0) -> None:
+        """Takes the voxels of one view by rising key, and the means (N, 3) of the points in each; none without."""
         self.side = side
-        self._keys: Keys = np.zeros(0, np.int64)
-        self.points: Array = np.zeros((0, 3))
-        self.hits: Array = np.zeros(0)
-        self.free: Array = np.zeros(0)
-        self.other: Array = np.zeros(0)
-        self.times: Array = np.zeros(0)
+        self.points: Array = np.zeros((0, 3)) if points is None else points
+        count = len(self.points)
+        self.hits, self.free, self.other = np.ones(count), np.zeros(count), np.zeros(count)
+        self.times = np.full(count, float(stamp))
+        self._set_keys(np.zeros(0, np.int64) if keys is None else keys)
+
+    def _set_keys(self, keys: Keys) -> None:
+        """Takes the voxels that there are now, of which nothing is worked out yet."""
+        self._keys = keys
         self._tree: cKDTree | None = None
         self._bounds: tuple[Array, Array] | None = None
         self._middle: Array | None = None
 
     @classmethod
-    def of(cls, points: Array, side: float, stamp: int = 0) -> Cells:
+    def of(cls, points: Array, side: float, stamp: int = 0) -> VoxelSet:
         """Returns the voxels of one view's points (N, 3)."""
         return cls.of_each([points], side, stamp)[0]
 
     @classmethod
-    def of_each(cls, sets: Sequence[Array], side: float, stamp: int = 0) -> list[Cells]:
+    def of_each(cls, sets: Sequence[Array], side: float, stamp: int = 0) -> list[VoxelSet]:
         """Returns the voxels of each of several sets of one view's points: together they take a third of the time."""
         if not sets:
             return []
@@ -70,20 +75,12 @@ class Cells:
         means = np.stack([np.bincount(of, column) for column in points.T], axis=1) / counts[:, None]
         ends = np.cumsum(np.bincount(of_set[first], minlength=len(sets)))[:-1]
         parts = zip(np.split(ranked[first], ends), np.split(means, ends), strict=True)
-        return [cls._made(side, own_keys, own_means, stamp) for own_keys, own_means in parts]
-
-    @classmethod
-    def _made(cls, side: float, keys: Keys, points: Array, stamp: int) -> Cells:
-        made = cls(side)
-        made._keys, made.points = keys, points
-        made.hits, made.free, made.other = np.ones(len(keys)), np.zeros(len(keys)), np.zeros(len(keys))
-        made.times = np.full(len(keys), float(stamp))
-        return made
+        return [cls(side, own_keys, own_means, stamp) for own_keys, own_means in parts]
 
     def __len__(self) -> int:
         return len(self._keys)
 
-    def add(self, other: Cells) -> None:
+    def add(self, other: VoxelSet) -> None:
         """Takes in the voxels of another view, or of another object that is the same."""
         keys, own, new = _merged(self._keys, other._keys)
 
@@ -105,7 +102,7 @@ class Cells:
         self.free = together(self.free, -other.hits).clip(min=0)  # a voxel that is seen again was not free after all
         self.other = together(self.other, other.other)
         self.hits, self.points = hits, points
-        self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
+        self._set_keys(keys)
 
     def correct(self, correction: Correction) -> None:
         """Moves each voxel with the place from which it was seen; those that fall into one are one."""
@@ -117,7 +114,7 @@ class Cells:
         counts = (np.bincount(of, each, count) for each in (self.hits, self.free, self.other))
         self.hits, self.free, self.other = (np.asarray(each, np.float64) for each in counts)
         self.points, self.times = np.stack(means[:3], axis=1), means[3]
-        self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
+        self._set_keys(keys)
 
     def carve(self, free: NDArray[np.bool_]) -> None:
         """Counts the voxels that a view saw through, and drops those that were seen through too often."""
@@ -126,12 +123,11 @@ class Cells:
         self.free = self.free + free
         gone = (self.free >= 3) & (self.free > 0.5 * self.hits)
         if gone.any():
-            self._keys, self.points = self._keys[~gone], self.points[~gone]
-            self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
-            self.times = self.times[~gone]
-            self._tree = self._bounds = self._middle = None
+            for name in _COLUMNS:
+                setattr(self, name, getattr(self, name)[~gone])
+            self._set_keys(self._keys[~gone])
 
-    def doubt(self, confirmed: NDArray[np.bool_], shown: Cells, weight: int) -> None:
+    def doubt(self, confirmed: NDArray[np.bool_], shown: VoxelSet, weight: int) -> None:
         """Counts the confirmed voxels that are not near those which the object showed in the same view, as `weight`."""
         rows = np.flatnonzero(confirmed)
         if not (len(shown) and len(rows)):
@@ -160,7 +156,7 @@ class Cells:
         found[around] = np.isfinite(apart)
         return found
 
-    def sure(self, others: Sequence[Cells] = ()) -> Array:
+    def sure(self, others: Sequence[VoxelSet] = ()) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others.
 
         Those that `others` have too are theirs, unless too few would be left.
@@ -212,7 +208,7 @@ class Cells:
         apart, _ = self.tree().query(points[:: -(-len(points) // 100)], distance_upper_bound=distance)
         return float(np.isfinite(apart).mean())
 
-    def apart(self, other: Cells) -> float:
+    def apart(self, other: VoxelSet) -> float:
         """Returns how far the axis-parallel bounds of two sets are apart along the axis along which they are most.
 
         Negative where they overlap; infinite where one is empty.
@@ -223,16 +219,14 @@ class Cells:
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
     def snapshot(self) -> dict[str, Any]:
-        named = ("points", "hits", "free", "other", "times")
-        return {"keys": self._keys} | {name: getattr(self, name) for name in named}
+        return {"keys": self._keys} | {name: getattr(self, name) for name in _COLUMNS}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._keys = np.array(state["keys"], np.int64)
-        self.points = np.array(state["points"], np.float64).reshape(-1, 3)
-        self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
-        self.other = np.array(state["other"], np.float64)
-        self.times = np.array(state.get("times", np.zeros(len(self.hits))), np.float64)  # earlier versions have none
-        self._tree = self._bounds = self._middle = None
+        earlier = {"times": np.zeros(len(state["hits"]))}  # earlier versions have none
+        for name in _COLUMNS:
+            setattr(self, name, np.array({**earlier, **state}[name], np.float64))
+        self.points = self.points.reshape(-1, 3)
+        self._set_keys(np.array(state["keys"], np.int64))
 
 
 def standing_box(points: Array) -> tuple[Array, Array, float]:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from operators.labels import SizePrior
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
 
 CHAIR = 0
 SIZES = SizePrior((0.5, 0.5, 0.9), (0.1, 0.1, 0.1))
-KINDS = Kinds([], {CHAIR: (SIZES,)})
+PRIORS = ClassPriors([], {CHAIR: (SIZES,)})
 EYE = np.array([2.0, -1.0, 1.5])
 
 
@@ -28,7 +28,7 @@ def seen(heading: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_wall_behind_a_thing_is_left_out_whatever_the_direction_of_view(heading: float) -> None:
     chair, wall = seen(heading)
 
-    kept = KINDS.near_side(np.vstack([wall, chair]), CHAIR, EYE, noise=0.0)
+    kept = PRIORS.near_side(np.vstack([wall, chair]), CHAIR, EYE, noise=0.0)
 
     np.testing.assert_allclose(kept, chair)
 
@@ -36,4 +36,4 @@ def test_a_wall_behind_a_thing_is_left_out_whatever_the_direction_of_view(headin
 def test_points_of_a_class_without_a_usual_size_stay() -> None:
     points = np.vstack(seen(0.0))
 
-    assert KINDS.near_side(points, CHAIR + 1, EYE, noise=0.0) is points
+    assert PRIORS.near_side(points, CHAIR + 1, EYE, noise=0.0) is points
