@@ -17,10 +17,11 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
-from operators.odometry.lidar.tracker import LidarTracker, State, Tracked, TrackerConfig
+from operators.odometry.lidar.tracker import LidarTracker, Tracked, TrackerConfig
+from operators.odometry.tracking import Status
 
 _STAMPED = {"begin": 0.0, "middle": 0.5, "end": 1.0}
-_LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
+_LEVELS = {Status.PREDICTED: Level.WARN, Status.LOST: Level.ERROR}
 
 
 class Sweep(BaseModel):
@@ -130,7 +131,7 @@ class LidarOdometry(Operator):
         self.state.counts[tracked.state.value] += 1
         self.state.counts["with a direction untold"] += len(tracked.blind) > 0
         messages: dict[str, Message] = {"status": _status(cloud.stamp, tracked)}
-        if tracked.state is not State.LOST:
+        if tracked.state is not Status.LOST:
             messages["odometry"] = self._odometry(cloud.stamp, body, T_body_lidar, tracked)
         return messages, tracked, T_body_lidar
 

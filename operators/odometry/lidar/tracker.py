@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from operators.odometry.lidar.map import PlaneMap
 from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
 from operators.odometry.lidar.scan import Scan, prepare
 from operators.odometry.lidar.search import ANY_TURN, apart, around, places
+from operators.odometry.tracking import Status
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
@@ -31,15 +31,6 @@ _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of h
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
 _RIVAL, _FAR_RIVAL = 0.03, 0.05  # a second place whose agreement is that near to the best one's makes a pose ambiguous
-
-
-class State(StrEnum):
-    """Holds what the pose of a scan rests on."""
-
-    TRACKING = "tracking"  # this scan, or it begins the map
-    RELOCALISED = "relocalised"  # this scan, in the map found again after a loss
-    PREDICTED = "predicted"  # the motion so far
-    LOST = "lost"  # nothing for longer than the patience, or there is no map, or a new one begins
 
 
 @dataclass(frozen=True)
@@ -71,7 +62,7 @@ class Tracked:
     the stamp; None where the pose or the velocity was not measured.
     """
 
-    state: State
+    state: Status
     reason: str
     T: Matrix
     covariance: Matrix
@@ -133,7 +124,7 @@ class LidarTracker(Remembered):
             reason = _elsewhere(fits, _FAR_RIVAL if fresh else _RIVAL, anywhere=lost or fresh)
         if reason:
             return self._unmeasured(scan, stamp, reason)
-        return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
+        return self._measured(scan, stamp, fits[0], Status.RELOCALISED if lost else Status.TRACKING)
 
     def _patience(self, stamp: int) -> float:
         """Returns the seconds without a measured pose until the sensor is lost at a stamp: two scans at least."""
@@ -147,7 +138,7 @@ class LidarTracker(Remembered):
         self._first = scan
         self._epochs = [np.zeros((6, 6))]
         self._map.add(scan.points, 0, np.zeros(3))
-        return self._result(State.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
+        return self._result(Status.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
 
     def _anew(self, scan: Scan, stamp: int) -> Tracked:
         """Begins a new map where the sensor may be."""
@@ -159,7 +150,7 @@ class LidarTracker(Remembered):
         self._first, self._epochs, self._epoch_T = scan, [self._motion.covariance], T
         self._map.add(scan.points @ T[:3, :3].T + T[:3, 3], 0, T[:3, 3])
         reason = f"nothing was measured for {gone:.1f} s: a new map begins here"
-        return self._result(State.LOST, reason, scan, self._motion, covariance)
+        return self._result(Status.LOST, reason, scan, self._motion, covariance)
 
     def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
         """Returns where to look: at the predicted pose, and around it where the sensor may be far from there."""
@@ -242,7 +233,7 @@ class LidarTracker(Remembered):
                 return f"it would mean a jump of {step:.2f} m and {turn:.1f} degrees from the motion so far"
         return ""
 
-    def _measured(self, scan: Scan, stamp: int, found: Fit, state: State) -> Tracked:
+    def _measured(self, scan: Scan, stamp: int, found: Fit, state: Status) -> Tracked:
         motion, config = self._motion, self._config
         assert motion is not None
         self._first, self._missed = None, 0
@@ -252,7 +243,7 @@ class LidarTracker(Remembered):
         information = found.information / config.correlation
         covariance, own = corrected(found.T, information, spread, of_map, motion.covariance)
         dt = motion.seconds(stamp)
-        if state is State.RELOCALISED:  # a way crossed unseen is no evidence on the velocity
+        if state is Status.RELOCALISED:  # a way crossed unseen is no evidence on the velocity
             self._motion = LidarMotion(stamp, found.T, np.zeros(6), covariance)
             points = None
         else:
@@ -287,12 +278,12 @@ class LidarTracker(Remembered):
         self._missed += 1
         if self._motion is None:
             nowhere = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
-            return self._result(State.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
+            return self._result(Status.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
         T, covariance = self._blindly(stamp)
         lost = self._motion.seconds(stamp) > self._patience(stamp)
         velocity = np.zeros(6) if lost else self._motion.velocity
         there = replace(self._motion, T=T, velocity=velocity)
-        return self._result(State.LOST if lost else State.PREDICTED, reason, scan, there, covariance)
+        return self._result(Status.LOST if lost else Status.PREDICTED, reason, scan, there, covariance)
 
     def _blindly(self, stamp: int) -> tuple[Matrix, Matrix]:
         """Returns the predicted pose and the covariance of its right perturbation."""
@@ -303,7 +294,7 @@ class LidarTracker(Remembered):
         return T, as_right(self._motion.covariance, T) + spread
 
     def _result(
-        self, state: State, reason: str, scan: Scan, motion: LidarMotion, covariance: Matrix,
+        self, state: Status, reason: str, scan: Scan, motion: LidarMotion, covariance: Matrix,
         velocity_covariance: Matrix | None = None, blind: NDArray[np.float64] | None = None,
         counts: Mapping[str, int] | None = None,
     ) -> Tracked:  # fmt: skip

@@ -490,7 +490,7 @@ def _root(covariance: Array) -> Array:
 
 
 def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi
+    return float((angle + math.pi) % (2 * math.pi) - math.pi)
 
 
 def _within(seen: Array, points: Array) -> NDArray[np.bool_]:

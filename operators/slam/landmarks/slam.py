@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, LandmarkSightings, Odometry, Transforms
-from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix, transform_points, yaw_of
+from dataflow.messages.geometry import invert, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
+from operators.geometry.planar import PLANAR, flat, placed_in, planar
 from operators.slam.landmarks.association import Association
 from operators.slam.landmarks.filter import LandmarkFilter
 from operators.status import counted_status
@@ -102,11 +103,15 @@ class LandmarkSlam(Operator, merge=True):
         if odometry is None:
             return None
         seen = self._advance(odometry)
-        T_map_base = _matrix(self.state.filter.position, self.state.filter.heading)
-        result: dict[str, Any] = {"pose": self._pose(odometry, T_map_base)}
+        x, y = self.state.filter.position
+        T_map_base = planar(x, y, self.state.filter.heading)
+        covariance = self.state.filter.pose_covariance()
+        result: dict[str, Any] = {
+            "pose": placed_in(self.map_frame, odometry.child_frame, T_map_base, covariance, odometry)
+        }
         if seen:
             result["correction"] = Transforms.from_matrix(
-                T_map_base @ invert(_flat(odometry)),
+                T_map_base @ invert(flat(odometry)),
                 stamp=odometry.stamp,
                 frame=self.map_frame,
                 child_frame=odometry.frame,
@@ -154,8 +159,8 @@ class LandmarkSlam(Operator, merge=True):
         points, spread = _cartesian(sightings)
         yaw = math.atan2(T_base_sensor[1, 0], T_base_sensor[0, 0])
         R = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-        flat = transform_points(T_base_sensor, points)[:, :2]
-        usable = np.asarray(np.isfinite(flat).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
+        level = transform_points(T_base_sensor, points)[:, :2]
+        usable = np.asarray(np.isfinite(level).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
         usable &= np.linalg.det(np.where(usable[:, None, None], spread, 0.0)) > 0
         self.state.ignored["invalid"] += int((~usable).sum())
         ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
@@ -164,7 +169,7 @@ class LandmarkSlam(Operator, merge=True):
         again = ~first & (ids >= 0)  # one landmark is one sighting of a message
         self.state.ignored["twice in a message"] += int((usable & again).sum())
         usable &= ~again
-        return ids[usable], flat[usable], R @ spread[usable] @ R.T
+        return ids[usable], level[usable], R @ spread[usable] @ R.T
 
     def _advance(self, odometry: Odometry) -> bool:
         """Moves to an odometry message, with the sightings on the way; returns whether there were any."""
@@ -174,7 +179,7 @@ class LandmarkSlam(Operator, merge=True):
             begin = odometry.stamp
         else:
             begin, span = last.stamp, odometry.stamp - last.stamp
-            T = invert(_flat(last)) @ _flat(odometry)
+            T = invert(flat(last)) @ flat(odometry)
             step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
             reach = self.max_speed * span * 1e-9
             if math.hypot(step[0], step[1]) > reach:
@@ -205,28 +210,13 @@ class LandmarkSlam(Operator, merge=True):
     def _noise(self, odometry: Odometry, step: Array, seconds: float) -> Array:
         """Covariance (3, 3) of a step (x, y, heading)."""
         if odometry.twist_covariance is not None:
-            planar = [0, 1, 5]
-            given = odometry.twist_covariance[np.ix_(planar, planar)]
+            given = odometry.twist_covariance[np.ix_(PLANAR, PLANAR)]
             if np.isfinite(given).all() and (np.diag(given) >= 0).all():
                 return np.asarray(given * seconds**2)
             self.state.ignored["covariance of odometry: not finite or negative"] += 1
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
-
-    def _pose(self, odometry: Odometry, T_map_base: Array) -> Odometry:
-        covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
-        planar = [0, 1, 5]
-        covariance[np.ix_(planar, planar)] = self.state.filter.pose_covariance()
-        return Odometry.from_matrix(
-            T_map_base,
-            stamp=odometry.stamp,
-            frame=self.map_frame,
-            child_frame=odometry.child_frame,
-            linear=odometry.linear,
-            angular=odometry.angular,
-            pose_covariance=covariance,
-        )
 
 
 def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
@@ -252,15 +242,6 @@ def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
     return points, J @ sightings.covariances[:, :2, :2] @ J.transpose(0, 2, 1)
 
 
-def _flat(odometry: Odometry) -> Array:
-    """The pose in the plane, as a rigid motion (4, 4)."""
-    return _matrix(odometry.position[:2], float(yaw_of(odometry.orientation)))
-
-
-def _matrix(position: Array, heading: float) -> Array:
-    return transform_matrix([position[0], position[1], 0.0], quaternion_from_yaw(heading))
-
-
 def _arc(step: Array, share: float) -> Array:
     """The motion (4, 4) after a share of a step (x, y, turn) at constant velocity."""
     turn = float(step[2])
@@ -269,4 +250,4 @@ def _arc(step: Array, share: float) -> Array:
     vx, vy = chord * step[0] + half * step[1], chord * step[1] - half * step[0]
     part = turn * share
     a, b = (share, share * part / 2) if abs(turn) < 1e-6 else (math.sin(part) / turn, (1 - math.cos(part)) / turn)
-    return _matrix(np.array([a * vx - b * vy, b * vx + a * vy]), part)
+    return planar(a * vx - b * vy, b * vx + a * vy, part)

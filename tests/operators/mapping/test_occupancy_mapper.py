@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 
 from dataflow.messages import Diagnostics, Message, OccupancyGrid, Odometry, PointCloud, Pose, Transforms
 from dataflow.testing import play
@@ -165,16 +166,6 @@ def test_a_band_or_range_that_holds_nothing_is_refused(params: dict[str, float])
         OccupancyMapper(**params).setup()
 
 
-def test_runs_repeat_and_go_on_from_a_snapshot() -> None:
-    clouds = [cloud(walls((0.1 * k, 0.0)), k + 1) for k in range(6)]
-    poses: list[Pose | Odometry] = [pose([0.1 * k, 0, 0.6], k + 1) for k in range(6)]
-    one, two = (mapped(clouds, poses) for _ in range(2))
-    assert [m.digest() for m in one["map"]] == [m.digest() for m in two["map"]]
-    first, second = OccupancyMapper(period=1), OccupancyMapper(period=1)
-    first.setup()
-    second.setup()
-    for k in range(3):
-        first.process(clouds[k], poses[k])
-    second.restore(first.snapshot())
-    again = [second.process(clouds[k], poses[k])["map"] for k in range(3, 6)]
-    assert [m.digest() for m in again] == [m.digest() for m in one["map"][3:]]
+def test_restored_operator_resumes_alike() -> None:
+    firings = [(cloud(walls((0.1 * k, 0.0)), k + 1), pose([0.1 * k, 0, 0.6], k + 1)) for k in range(6)]
+    assert_resumes_alike(lambda: OccupancyMapper(period=1), firings, 3)

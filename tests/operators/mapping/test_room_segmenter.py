@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Diagnostics, OccupancyGrid, Rooms
@@ -185,18 +186,9 @@ def test_a_narrowest_door_above_the_widest_is_refused() -> None:
         only(flat(), narrowest=1.5)
 
 
-def test_two_plays_are_equal_and_a_restored_segmenter_goes_on_the_same() -> None:
+def test_restored_operator_resumes_alike() -> None:
     maps = [FloorPlan(5.0, 4.5, corner=(4.5, 1.9)).rooms(RIGHT).at(0), flat().at(3), flat().at(6)]
-    whole, again = (play(RoomSegmenter(), {"map": maps}) for _ in range(2))
-    assert whole.digests() == again.digests()
-    first, second = RoomSegmenter(), RoomSegmenter()
-    for operator in (first, second):
-        operator.setup()
-    first.process(maps[0])
-    snapshot = first.snapshot()
-    assert snapshot is not None
-    second.restore(snapshot)
-    assert [second.process(m)["rooms"] for m in maps[1:]] == whole["rooms"][1:]
+    assert_resumes_alike(RoomSegmenter, [(each,) for each in maps], 1)
 
 
 @pytest.mark.parametrize("clear", [0.7, 0.83, 1.0])

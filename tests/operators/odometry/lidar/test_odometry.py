@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from made_beams import CORRIDOR, beams, cast
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike
 
 from dataflow.messages import Diagnostics, Odometry, PointCloud, Transforms
 from dataflow.messages.geometry import invert
@@ -408,18 +409,8 @@ def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() ->
     assert np.sqrt(last.pose_covariance[0, 0]) > 1.0  # it may be anywhere by now, and says so
 
 
-def test_repeated_runs_give_equal_bits_and_a_snapshot_goes_on_alike() -> None:
-    clouds = [scan(ROOM, circling, k, timed=True) for k in range(8)]
-    first, second = (play(LidarOdometry(), {"cloud": clouds}) for _ in range(2))
-    assert first.digests() == second.digests()
-    whole, halves = LidarOdometry(), [LidarOdometry(), LidarOdometry()]
-    for operator in (whole, *halves):
-        operator.setup()
-    expected = [whole.process(cloud)["odometry"].digest() for cloud in clouds]
-    found = [halves[0].process(cloud)["odometry"].digest() for cloud in clouds[:5]]
-    halves[1].restore(halves[0].snapshot())
-    found += [halves[1].process(cloud)["odometry"].digest() for cloud in clouds[5:]]
-    assert found == expected
+def test_restored_operator_resumes_alike() -> None:
+    assert_resumes_alike(LidarOdometry, [(scan(ROOM, circling, k, timed=True),) for k in range(8)], 5)
 
 
 def test_near_must_be_less_than_far() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from made_walls import RATE, SIZE, K, aside, depth_from, rendered
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image, Transforms
 from dataflow.messages.geometry import transform_points
 from dataflow.testing import Played, play
@@ -219,26 +219,12 @@ def test_depth_without_a_calibration_is_refused() -> None:
         operator.process(given["image"][0], given["image_info"][0], depth=given["depth"][0])
 
 
-def test_a_restored_operator_goes_on_with_the_same_bytes() -> None:
+def test_restored_operator_resumes_alike() -> None:
     given = streams({k: measured(k) for k in range(0, COUNT, 3)})
     depths = {d.stamp: d for d in given["depth"]}
-    calibrations = given["image_info"][0], None, None
-
-    def step(operator: MonoVisualOdometry, k: int) -> Any:
-        return operator.process(given["image"][k], *calibrations, depths.get(stamp(k)), given["depth_info"][0])
-
-    whole, first, second = MonoVisualOdometry(), MonoVisualOdometry(), MonoVisualOdometry()
-    for operator in (whole, first, second):
-        operator.setup()
-    for k in range(22):
-        step(whole, k)
-        step(first, k)
-    second.restore(unpack_state(pack_state(first.snapshot())))
-    for k in range(22, 32):
-        wanted, got = step(whole, k), step(second, k)
-        assert got["odometry"].digest() == wanted["odometry"].digest()
-        assert got["status"].digest() == wanted["status"].digest()
-    assert second.summary() == whole.summary()
+    info, depth_info = given["image_info"][0], given["depth_info"][0]
+    firings = [(image, info, None, None, depths.get(image.stamp), depth_info) for image in given["image"][:32]]
+    assert_resumes_alike(MonoVisualOdometry, firings, 22)
 
 
 def test_two_sources_of_metres_make_a_scale_no_less_sure() -> None:

@@ -131,21 +131,6 @@ def test_a_view_of_something_else_is_lost_until_a_new_map_begins() -> None:
     assert Status.TRACKING not in [r.track.status for r in results[20:23]]
 
 
-@pytest.mark.long
-def test_the_same_images_give_the_same_bytes_also_from_a_snapshot() -> None:
-    images = rendered(30)
-    first = follow(images)
-    odometry = MonoOdometry(K)
-    for k in range(15):
-        odometry.track(images[k], k * 10**9 // RATE)
-    other = MonoOdometry(K)
-    other.state = odometry.state
-    for k in range(15, 30):
-        result = other.track(images[k], k * 10**9 // RATE)
-        assert result.track.T_world_camera.tobytes() == first[k].track.T_world_camera.tobytes()
-        assert result.track.covariance.tobytes() == first[k].track.covariance.tobytes()
-
-
 def test_wrong_images_and_stamps_are_refused() -> None:
     odometry = MonoOdometry(K)
     odometry.track(rendered(1)[0], 5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -17,11 +16,10 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from operator_runs import assert_one_calibration, assert_resumes_alike
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
-from dataflow.testing import play
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.rgbd import tracker
@@ -790,16 +788,6 @@ def test_same_frames_give_the_same_bytes_in_another_process(repository: Path) ->
     assert other.stdout.strip() == digest(follow(sequence(25, 3.0)[0][:12]))
 
 
-def test_restored_state_goes_on_alike() -> None:
-    frames, _ = sequence(40)
-    one, other = RgbdOdometry(camera()), RgbdOdometry(camera())
-    for i in range(20):
-        one.track(*frames[i], i * 33_000_000)
-    other.state = pickle.loads(pickle.dumps(one.state))
-    rest = [[o.track(*frames[i], i * 33_000_000) for i in range(20, 30)] for o in (one, other)]
-    assert digest(rest[0]) == digest(rest[1])
-
-
 def test_results_are_not_views_of_the_state() -> None:
     frames, _ = sequence(40)
     odometry = RgbdOdometry(camera())
@@ -808,6 +796,15 @@ def test_results_are_not_views_of_the_state() -> None:
 
 
 # -- the operator --------------------------------------------------------------------------------------------
+
+
+def messages(count: int) -> tuple[list[Image], list[DepthImage]]:
+    """The first images and depth images of the sequence of 40 frames, at 30 Hz."""
+    frames, stamps = sequence(40)[0][:count], [k * 33_000_000 for k in range(count)]
+    return (
+        [Image(stamp=t, frame="color", data=image) for t, (image, _) in zip(stamps, frames, strict=True)],
+        [DepthImage(stamp=t, frame="depth", data=depth) for t, (_, depth) in zip(stamps, frames, strict=True)],
+    )
 
 
 def info(frame: str, K: NDArray[np.float64]) -> CameraInfo:
@@ -835,52 +832,18 @@ def test_operator_gives_the_core_poses_in_named_frames() -> None:
 
 
 @pytest.mark.long
-def test_operator_goes_on_alike_from_a_recorded_state() -> None:
-    frames, _ = sequence(40)
-
-    def given(i: int) -> tuple[Image, DepthImage, CameraInfo, CameraInfo]:
-        image, depth = frames[i]
-        stamp = i * 33_000_000
-        return (
-            Image(stamp=stamp, frame="color", data=image),
-            DepthImage(stamp=stamp, frame="depth", data=depth),
-            info("color", K_COLOR),
-            info("depth", K_DEPTH),
-        )
-
-    one, other = VisualOdometry(), VisualOdometry()
-    one.setup()
-    other.setup()
-    other.restore(unpack_state(pack_state(one.snapshot())))  # of no frame
-    for i in range(20):
-        one.process(*given(i))
-    recorded = pack_state(one.snapshot())
-
-    other.restore(unpack_state(recorded))
-
-    assert pack_state(other.snapshot()) == recorded
-    for i in range(20, 30):
-        sent, again = one.process(*given(i)), other.process(*given(i))
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+def test_restored_operator_resumes_alike() -> None:
+    calibration = info("color", K_COLOR), info("depth", K_DEPTH)
+    assert_resumes_alike(VisualOdometry, [(*pair, *calibration) for pair in zip(*messages(30), strict=True)], 20)
 
 
 @pytest.mark.long
-def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
-    frames, _ = sequence(40)
-    stamps = [k * 33_000_000 for k in range(8)]
-    images = [Image(stamp=t, frame="color", data=image) for t, (image, _) in zip(stamps, frames, strict=False)]
-    depths = [DepthImage(stamp=t, frame="depth", data=depth) for t, (_, depth) in zip(stamps, frames, strict=False)]
-    once = {"image": images, "depth": depths, "image_info": [info("color", K_COLOR)]}
-    once |= {"depth_info": [info("depth", K_DEPTH)]}
-    each = once | {
-        name: [once[name][0].replace(stamp=stamp) for stamp in stamps] for name in ("image_info", "depth_info")
-    }
-    expected = play(VisualOdometry(), once, static=["image_info", "depth_info"])
-    assert play(VisualOdometry(), each).digests() == expected.digests()
-    each["depth_info"][5] = info("depth", np.diag([1.1, 1.1, 1.0]) @ K_DEPTH).replace(stamp=stamps[5])
-    with pytest.raises(Exception, match="the calibration changed"):
-        play(VisualOdometry(), each)
+def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
+    images, depths = messages(8)
+    given = {"image": images, "depth": depths, "image_info": [info("color", K_COLOR)]}
+    given |= {"depth_info": [info("depth", K_DEPTH)]}
+    other = info("depth", np.diag([1.1, 1.1, 1.0]) @ K_DEPTH)
+    assert_one_calibration(VisualOdometry, given, ["image_info", "depth_info"], "depth", other, 5)
 
 
 def test_a_clock_that_begins_anew_begins_a_new_path() -> None:

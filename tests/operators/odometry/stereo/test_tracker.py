@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
@@ -347,26 +347,13 @@ def infos() -> tuple[CameraInfo, CameraInfo]:
 
 
 @pytest.mark.long
-def test_operator_goes_on_alike_from_a_recorded_state() -> None:
+def test_restored_operator_resumes_alike() -> None:
     pairs, _ = sequence(25)
-
-    def given(i: int) -> tuple[Image, Image, CameraInfo, CameraInfo]:
-        left, right = (
-            Image(stamp=i * 100_000_000, frame=f, data=d) for f, d in zip(("left", "right"), pairs[i], strict=True)
-        )
-        return left, right, *infos()
-
-    one, other = StereoVisualOdometry(), StereoVisualOdometry()
-    one.setup()
-    other.setup()
-    for i in range(10):
-        sent = one.process(*given(i))
-    assert (sent["odometry"].child_frame, sent["status"].names) == ("left", ("visual_odometry",))
-    other.restore(unpack_state(pack_state(one.snapshot())))
-    for i in range(10, 15):
-        a, b = one.process(*given(i)), other.process(*given(i))
-        assert {port: m.digest() for port, m in a.items()} == {port: m.digest() for port, m in b.items()}
-    assert one.summary() == other.summary() == {"tracking": 15}
+    firings = [
+        (*(Image(stamp=i * 100_000_000, frame=f, data=d) for f, d in (("left", left), ("right", right))), *infos())
+        for i, (left, right) in enumerate(pairs[:15])
+    ]
+    assert assert_resumes_alike(StereoVisualOdometry, firings, 10).summary() == {"tracking": 15}
 
 
 # -- recorded data -------------------------------------------------------------------------------------------

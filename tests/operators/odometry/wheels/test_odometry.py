@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from operator_runs import assert_resumes_alike
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import Diagnostics, JointState, Odometry, WheelTicks
@@ -236,17 +237,6 @@ def test_joints_that_tell_nothing_are_named() -> None:
         driven([JointState(stamp=0, names=("left", "right"))])
 
 
-def test_two_plays_are_equal_and_a_restored_operator_goes_on_alike() -> None:
-    messages = ticks(steady(0.5, 0.4, 3.0))
-    whole = driven(messages)
-    assert whole.digests() == driven(messages).digests()
-    first, second = (WheelOdometry(**SIDE, max_acceleration=50.0) for _ in range(2))
-    for operator in (first, second):
-        operator.setup()
-    for message in messages[:30]:
-        first.process(message)
-    second.restore(first.snapshot())
-    for message in messages[30:]:
-        expected, found = first.process(message), second.process(message)
-        assert {k: m.digest() for k, m in found.items()} == {k: m.digest() for k, m in expected.items()}
-    assert second.summary() == first.summary()
+def test_restored_operator_resumes_alike() -> None:
+    firings = [(message,) for message in ticks(steady(0.5, 0.4, 3.0))]
+    assert_resumes_alike(lambda: WheelOdometry(**SIDE, max_acceleration=50.0), firings, 30)

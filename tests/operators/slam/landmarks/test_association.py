@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 
 from dataflow.messages import Level
 from dataflow.testing import play
@@ -114,19 +115,9 @@ def test_odometry_noisier_than_told_is_reported_and_the_map_stays_whole() -> Non
 
 @pytest.mark.long
 @pytest.mark.parametrize("half", [40, 70])
-def test_a_snapshot_without_identities_goes_on_as_the_operator_would(half: int) -> None:
+def test_operator_without_identities_resumes_alike(half: int) -> None:
     messages = Walk(4).messages(known=False)
-    whole = LandmarkSlam()
-    whole.setup()
-    for k, (odometry, sightings) in enumerate(zip(messages["odometry"], messages["sightings"], strict=True)):
-        if k == half:
-            copy = LandmarkSlam()
-            copy.setup()
-            copy.restore(whole.snapshot())
-        expected = whole.process(odometry, sightings) or {}  # type: ignore[arg-type]
-        if k >= half:
-            got = copy.process(odometry, sightings) or {}  # type: ignore[arg-type]
-            assert {port: m.digest() for port, m in got.items()} == {port: m.digest() for port, m in expected.items()}
+    assert_resumes_alike(LandmarkSlam, list(zip(messages["odometry"], messages["sightings"], strict=True)), half)
 
 
 def test_the_status_is_given_every_second_and_names_what_was_done() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from operator_runs import assert_resumes_alike
 
 from dataflow.messages import LandmarkSightings, Odometry, Transforms
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix, yaw_of
@@ -198,30 +199,9 @@ def test_the_operator_gives_what_the_filter_gives() -> None:
     np.testing.assert_allclose(correction.matrix("odom") @ odometry.matrix(), pose.matrix(), atol=1e-9)
 
 
-@pytest.mark.long
-def test_equal_inputs_give_equal_bits() -> None:
-    first, second = (play(LandmarkSlam(association="unknown"), Walk(2).messages(known=False)) for _ in range(2))
-    for port in ("pose", "landmarks", "correction"):
-        assert [m.digest() for m in first[port]] == [m.digest() for m in second[port]]
-
-
-def test_a_snapshot_goes_on_as_the_operator_would() -> None:
-    walk, messages = Walk(4), Walk(4).messages()
-    whole = LandmarkSlam()
-    whole.setup()
-    for k, (odometry, sightings) in enumerate(zip(messages["odometry"], messages["sightings"], strict=True)):
-        if k == 50:
-            copy = LandmarkSlam()
-            copy.setup()
-            copy.restore(whole.snapshot())
-        expected = whole.process(odometry, sightings)  # type: ignore[arg-type]
-        if k >= 50:
-            got = copy.process(odometry, sightings)  # type: ignore[arg-type]
-            assert expected is not None
-            assert got is not None
-            assert got["pose"].digest() == expected["pose"].digest()
-            assert got["landmarks"].digest() == expected["landmarks"].digest()
-    assert len(walk.poses) == 121
+def test_restored_operator_resumes_alike() -> None:
+    messages = Walk(4).messages()
+    assert_resumes_alike(LandmarkSlam, list(zip(messages["odometry"], messages["sightings"], strict=True)), 50)
 
 
 def test_polar_sightings_of_a_mounted_sensor_are_the_same_landmarks() -> None:

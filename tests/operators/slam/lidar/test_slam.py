@@ -9,21 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import PointCloud, Transforms
 from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix
 from operators.odometry import LidarOdometry
-from operators.odometry.lidar.tracker import State, Tracked
+from operators.odometry.lidar.tracker import Tracked
+from operators.odometry.tracking import Status
 from operators.slam import LidarSlam
 from operators.slam.lidar.graph import LidarGraph, LidarSettings
 from operators.slam.lidar.map_file import read_lidar_map
-from operators.slam.lidar.mapper import LidarMapper, Mapped
+from operators.slam.lidar.mapper import LidarMapper
 from operators.slam.lidar.view import LidarEyes, LidarView
-from operators.slam.place import Place
+from operators.slam.place import Mapped, Place
 from tests.support.made_scans import HALL, HALL_BOXES, NOTHING, at, drifting, on_round, scan
 
 ROUND = 28  # scans
@@ -138,7 +139,7 @@ def mapper(rivals: int = 3) -> LidarMapper:
 
 
 def tracked(
-    T: Matrix, points: NDArray[np.float32] | None, covariance: Matrix, state: State = State.TRACKING
+    T: Matrix, points: NDArray[np.float32] | None, covariance: Matrix, state: Status = Status.TRACKING
 ) -> Tracked:
     none = np.zeros((0, 6))
     given = None if points is None else points.astype(np.float64)
@@ -175,7 +176,7 @@ def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the
     """The LiDAR is lost and carried across the room; its odometry begins anew, with a pose that means nothing."""
     slam, poses = mapper(), on_round(ROUND)
     mapped(poses, [invert(poses[0]) @ T for T in poses], slam)
-    lost = slam.take(tracked(np.eye(4), None, np.eye(6), State.LOST), 40 * STEP)
+    lost = slam.take(tracked(np.eye(4), None, np.eye(6), Status.LOST), 40 * STEP)
     assert (lost.place, lost.T_map_odom) == (Place.ADRIFT, None)
     there, wrong = elsewhere(16), at(9.0, -4.0, 1.0)
     results = [
@@ -268,45 +269,21 @@ def test_nothing_but_empty_scans_gives_no_pose() -> None:
     assert played["pose"] == played["odometry"] == played["map"] == []
 
 
-def test_the_same_scans_give_the_same_bytes(around: Played) -> None:
-    assert run(clouds(on_round(ROUND + 5))).digests() == around.digests()
+@pytest.mark.long
+def test_restored_operator_resumes_alike() -> None:
+    assert_resumes_alike(lambda: LidarSlam(**NEAR), [(cloud,) for cloud in clouds(on_round(ROUND + 4))], ROUND - 3)  # type: ignore[arg-type]
 
 
 @pytest.mark.long
-def test_a_restored_state_goes_on_alike() -> None:
-    given = clouds(on_round(ROUND + 4))
-    one, other = LidarSlam(**NEAR), LidarSlam(**NEAR)  # type: ignore[arg-type]
-    one.setup()
-    other.setup()
-    for cloud in given[: ROUND - 3]:
-        one.process(cloud)
-    recorded = pack_state(one.snapshot())
-    other.restore(unpack_state(recorded))
-    assert pack_state(other.snapshot()) == recorded
-    for cloud in given[ROUND - 3 :]:
-        sent, again = one.process(cloud), other.process(cloud)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+def test_operator_restored_while_a_saved_map_is_searched_resumes_alike(saved: Path) -> None:
+    firings = [(cloud,) for cloud in clouds(elsewhere(12), first=60)]
 
+    def make() -> LidarSlam:
+        return LidarSlam(map_file=str(saved), **NEAR)  # type: ignore[arg-type]
 
-@pytest.mark.long
-def test_a_state_that_is_restored_while_a_saved_map_is_searched_goes_on_alike(saved: Path) -> None:
-    given = clouds(elsewhere(12), first=60)
-    one, other = (LidarSlam(map_file=str(saved), **NEAR) for _ in range(2))  # type: ignore[arg-type]
-    one.setup()
-    other.setup()
-    seen_again = 0
-    for k, cloud in enumerate(given):
-        search = one.state.mapper.graph.search
-        if search is not None and search.sights:
-            recorded = pack_state(one.snapshot())
-            other.restore(unpack_state(recorded))
-            assert pack_state(other.snapshot()) == recorded
-            seen_again = k
-            break
-        one.process(cloud)
-    assert seen_again
-    for cloud in given[seen_again:]:
-        sent, again = one.process(cloud), other.process(cloud)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+    probe, searching = make(), 0
+    probe.setup()
+    while not (probe.state.mapper.graph.search and probe.state.mapper.graph.search.sights):
+        probe.process(*firings[searching])
+        searching += 1
+    assert_resumes_alike(make, firings, searching)

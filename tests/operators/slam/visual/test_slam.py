@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from operator_runs import assert_one_calibration, assert_resumes_alike
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
-from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play
-from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry import VisualOdometry
 from operators.slam import VisualSlam
@@ -234,40 +232,18 @@ def test_blind_frames_are_told_and_survived() -> None:
 
 
 @pytest.mark.long
-def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
-    once = streams(frames(on_round(8)))
-    stamps = [image.stamp for image in once["image"]]
-    each = once | {name: [once[name][0].replace(stamp=stamp) for stamp in stamps] for name in STATIC}
-    assert play(VisualSlam(), each).digests() == play(VisualSlam(), once, static=STATIC).digests()
-    each["image_info"][5] = info("color", 0.1).replace(stamp=stamps[5])
-    with pytest.raises(Exception, match="the calibration changed"):
-        play(VisualSlam(), each)
+def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
+    assert_one_calibration(
+        VisualSlam, streams(frames(on_round(8))), STATIC[::-1], "image", info("color", 0.1), 5
+    )  # fmt: skip
 
 
 @pytest.mark.long
-def test_the_same_frames_give_the_same_bytes(around: Played) -> None:
-    assert run(frames(on_round(ROUND + 6))).digests() == around.digests()
-
-
-@pytest.mark.long
-def test_a_restored_state_goes_on_alike() -> None:
-    seen = frames(on_round(ROUND + 4))
-    given = streams(seen)
-    one, other = VisualSlam(), VisualSlam()
-    one.setup()
-    other.setup()
-    other.restore(unpack_state(pack_state(one.snapshot())))  # of no frame
-    calibration = (given["image_info"][0], given["depth_info"][0])
-    for k in range(ROUND - 4):
-        one.process(given["image"][k], given["depth"][k], *calibration)
-    recorded = pack_state(one.snapshot())
-    other.restore(unpack_state(recorded))
-    assert pack_state(other.snapshot()) == recorded
-    for k in range(ROUND - 4, ROUND + 4):
-        sent = one.process(given["image"][k], given["depth"][k], *calibration)
-        again = other.process(given["image"][k], given["depth"][k], *calibration)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+def test_restored_operator_resumes_alike() -> None:
+    given = streams(frames(on_round(ROUND + 4)))
+    calibration = given["image_info"][0], given["depth_info"][0]
+    firings = [(*pair, *calibration) for pair in zip(given["image"], given["depth"], strict=True)]
+    assert_resumes_alike(VisualSlam, firings, ROUND - 4)
 
 
 @pytest.mark.long
@@ -279,7 +255,3 @@ def test_covariance_covers_the_error(around: Played) -> None:
         R = poses[0][:3, :3]
         squares.append(off @ np.linalg.solve(R @ pose.pose_covariance[:3, :3] @ R.T, off) / 3)
     assert 0.005 < np.mean(squares) < 3.0
-
-
-def test_truth_of_the_made_path_closes() -> None:
-    assert np.abs(se3.log(invert(on_round(1)[0]) @ on_round(1, ROUND)[0])).max() < 1e-9
