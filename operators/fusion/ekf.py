@@ -27,12 +27,12 @@ from dataflow.messages import (
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.alarms import Alarms
-from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.gate import GateConfig
+from operators.fusion.filter.history import Command
 from operators.fusion.filter.imu_dropout import ImuDropout
 from operators.fusion.filter.initialisation import COASTING, Prior, coasting_node, prior_of
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement
 from operators.fusion.filter.suspicions import LATE
 from operators.fusion.output import (
@@ -68,7 +68,7 @@ class State:
     lever_arms: LeverArms
     origin: tuple[float, float, float] | None
     strict: set[str] = field(default_factory=set)  # before the filter, which is made anew with their gates
-    filter: LateFilter | None = None
+    filter: ErrorStateFilter | None = None
     alarms: Alarms = field(default_factory=Alarms)
     last: LastMeasurements = field(default_factory=LastMeasurements)
     sure: bool = False
@@ -170,8 +170,8 @@ class EkfFusion(Operator):
             origin=self.origin,
         )
 
-    def new_part(self, kind: type[Any]) -> LateFilter:
-        return LateFilter(self._config(), coasting_node(0, self._prior(), self.gravity))
+    def new_part(self, kind: type[Any]) -> ErrorStateFilter:
+        return ErrorStateFilter(self._config(), coasting_node(0, self._prior(), self.gravity))
 
     def process(
         self,
@@ -289,13 +289,14 @@ class EkfFusion(Operator):
         )
         if begun is None:
             return False
-        self.state.filter = LateFilter(self._config(), begun[0])
+        self.state.filter = ErrorStateFilter(self._config(), begun[0])
         self.state.ignored["begun in motion"] += int(not begun[1])
         return True
 
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
         if self.state.filter is None and self.motion == "constant_velocity":
-            self.state.filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
+            start = coasting_node(message.stamp, self._prior(), self.gravity)
+            self.state.filter = ErrorStateFilter(self._config(), start)
         settings = self._settings(name)
         if never_yields(gate := settings.gate(use_of(name, message, settings))):  # by the setting, or by its type
             self.state.strict.add(name)

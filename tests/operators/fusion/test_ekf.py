@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_sensors import ORIGIN, RATE, T_BASE_IMU, Array, Robot, errors, extrinsics, fused
+from operator_runs import assert_resumes_alike, firings_of
 from scipy.spatial.transform import Rotation
 
 from dataflow.messages import (
@@ -307,25 +308,8 @@ def test_settings_are_checked() -> None:
         EkfFusion(sensors={"robot/fix": {"sigma": -1.0}})
 
 
-def test_two_plays_and_one_continued_from_a_snapshot_give_equal_bits() -> None:
+def test_restored_operator_resumes_alike() -> None:
     robot = Robot(4.0)
     streams = {"robot/imu": robot.imu, "robot/fix": robot.fixes(), "robot/radar": robot.scans()}
     params: dict[str, Any] = {"sensors": {"robot/radar": {"use": "doppler"}}, **HEADING}
-    assert fused(streams, **params)[1].digests() == fused(streams, **params)[1].digests()
-    one, other = (EkfFusion(origin=ORIGIN, **params) for _ in range(2))
-    for operator in (one, other):
-        operator.setup()
-    firings: dict[int, dict[str, Message]] = {}
-    for name, messages in streams.items():
-        for message in messages:
-            firings.setdefault(message.stamp, {})[f"ns/{name}"] = message
-    rows = sorted(firings.items())
-    for stamp, messages in rows[:110]:
-        one.process(messages, Context(stamp), extrinsics())
-    other.restore(one.snapshot())
-    for stamp, messages in rows[110:]:
-        first, second = (o.process(messages, Context(stamp), extrinsics()) for o in (one, other))
-        assert first is not None
-        assert second is not None
-        assert first["odometry"].digest() == second["odometry"].digest()
-    assert one.summary() == other.summary()
+    assert_resumes_alike(lambda: EkfFusion(origin=ORIGIN, **params), firings_of(streams, extrinsics()), 110)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from operators.fusion.filter.error_state import SIZE, State
+from operators.fusion.filter.gate import Repeat, repeat_of
 from operators.fusion.filter.measurements import AngularRate, FullPose, Measurement, Model, Position
-from operators.fusion.filter.repeats import Repeat, repeat_of
 
 ZERO = np.zeros(3)
 PLACE = np.array([1.0, 2.0, np.nan])

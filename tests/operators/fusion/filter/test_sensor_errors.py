@@ -11,9 +11,9 @@ from made_motion import GRAVITY, Motion
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import NavSatFix
 from operators.fusion.filter.error_state import SIZE, Noise, State
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.sensors.interpretation import Surroundings, measurements
@@ -25,14 +25,14 @@ RATE = 50
 DRIFT, WHITE = 0.1, 0.05
 
 
-def restored(errors: SensorErrors, filter: LateFilter) -> LateFilter:
+def restored(errors: SensorErrors, filter: ErrorStateFilter) -> ErrorStateFilter:
     """Returns a filter with settings of errors that goes on from another's snapshot."""
-    made = LateFilter(FilterConfig(errors=errors), filter._base)
+    made = ErrorStateFilter(FilterConfig(errors=errors), filter._base)
     made.restore(unpack_state(pack_state(filter.snapshot())))
     return made
 
 
-def driven(seed: int, errors: SensorErrors, seconds: float = 10.0) -> LateFilter:
+def driven(seed: int, errors: SensorErrors, seconds: float = 10.0) -> ErrorStateFilter:
     """A filter whose only positions have an error that stays nearly the same, and white noise."""
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * RATE)) / RATE
@@ -41,7 +41,7 @@ def driven(seed: int, errors: SensorErrors, seconds: float = 10.0) -> LateFilter
     accel = accel + 1e-3 * math.sqrt(RATE) * rng.standard_normal(accel.shape)
     samples = [Sample(round(x * 1e9), w, f, NOISE) for x, w, f in zip(t, gyro, accel, strict=True)]
     prior = Prior(heading=MOTION.phase, heading_sigma=0.02)
-    filter = LateFilter(FilterConfig(errors=errors), first_node(samples[:25], prior, -GRAVITY[2], at_rest=True))
+    filter = ErrorStateFilter(FilterConfig(errors=errors), first_node(samples[:25], prior, -GRAVITY[2], at_rest=True))
     drift = DRIFT * rng.standard_normal(3)
     total = WHITE**2 if errors.drifts else WHITE**2 + DRIFT**2
     for k in range(25, len(t)):
@@ -52,7 +52,7 @@ def driven(seed: int, errors: SensorErrors, seconds: float = 10.0) -> LateFilter
     return filter
 
 
-def nees(filter: LateFilter, seconds: float = 10.0) -> float:
+def nees(filter: ErrorStateFilter, seconds: float = 10.0) -> float:
     state, _ = filter.estimate(filter.time)
     off = state.position - MOTION.position(seconds - 1 / RATE)
     return float(off @ np.linalg.solve(state.covariance[:3, :3], off))
@@ -80,7 +80,7 @@ def test_a_drift_that_nobody_measures_keeps_its_spread() -> None:
     samples = [Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE) for k in range(3)]
     errors = SensorErrors(drifts=(("fix", (0.1, 0.2, 0.3), 0.5),))
     node = first_node(samples, Prior(heading=0.0), -GRAVITY[2], at_rest=True)
-    filter = LateFilter(FilterConfig(errors=errors), node)
+    filter = ErrorStateFilter(FilterConfig(errors=errors), node)
     for k in range(3, 150):
         filter.feel(Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE))
     state, _ = filter.estimate(filter.time)

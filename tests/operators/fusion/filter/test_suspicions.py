@@ -18,8 +18,8 @@ from operators.fusion.filter.error_state import (
     moved,
     propagated,
 )
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.history import Hypothesis, Node, Sample
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.filter.suspicions import LATE, SCALE, Fit, Suspicions, suspected
@@ -155,7 +155,7 @@ def test_a_filter_that_is_sure_of_a_wrong_heading_begins_anew_where_the_motion_o
     start = State(drive.places[0], wrong @ [0.65, 0, 0], wrong, ZERO, ZERO, np.diag(sigmas**2))
     gyro = np.column_stack([0 * drive.t, 0 * drive.t, drive.turning])
     node = Node(0, (Hypothesis(0.0, start),), gyro[0], drive.forces[0], window=Window(begins=False))
-    fused = LateFilter(FilterConfig(gravity=9.81), node)
+    fused = ErrorStateFilter(FilterConfig(gravity=9.81), node)
     for k, x in enumerate(drive.t[1:], 1):
         fused.feel(Sample(round(x * 1e9), gyro[k], drive.forces[k], NOISE))
         if k % 10 == 0:
@@ -178,7 +178,7 @@ def test_a_filter_older_than_the_window_begins_anew_by_stronger_evidence(old: bo
     window = replace(Drive(seconds=26).window(), motion=None)
     node = Node(0, (Hypothesis(0.0, ones),), ZERO, -DOWN, window=window if old else Window())
     assert bool(node.window.first) == old
-    fused = LateFilter(FilterConfig(gravity=9.81), node)
+    fused = ErrorStateFilter(FilterConfig(gravity=9.81), node)
     for k in range(1, 5):
         fused.feel(Sample(k * 10**8, ZERO, -DOWN, NOISE))
     end = replace(ones, rotation=exp_rotation(np.array([0.0, 0.0, off])))

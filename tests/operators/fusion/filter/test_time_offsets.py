@@ -14,9 +14,9 @@ from dataflow.messages import Diagnostics
 from dataflow.operator import Context
 from operators.fusion import EkfFusion
 from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import AngularRate, Measurement, Model, Orientation, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 
@@ -36,14 +36,14 @@ def measured(kind: str, t: float) -> tuple[Model, Array]:
     return Velocity(R.inv().apply(MOTION.velocity(t)), np.eye(3), np.zeros(3)), np.eye(3) * 0.02**2
 
 
-def restored(errors: SensorErrors, filter: LateFilter) -> LateFilter:
+def restored(errors: SensorErrors, filter: ErrorStateFilter) -> ErrorStateFilter:
     """Returns a filter with settings of errors that goes on from another's snapshot."""
-    made = LateFilter(FilterConfig(errors=errors), filter._base)
+    made = ErrorStateFilter(FilterConfig(errors=errors), filter._base)
     made.restore(unpack_state(pack_state(filter.snapshot())))
     return made
 
 
-def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, float, LateFilter]:
+def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, float, ErrorStateFilter]:
     """Offset found of one sensor beside positions with a true clock, its standard deviation, and the filter."""
     t = np.arange(int(seconds * RATE)) / RATE
     gyro, accel = MOTION.readings(t)
@@ -51,7 +51,7 @@ def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, fl
     prior = Prior(heading=MOTION.phase, heading_sigma=0.02, position=tuple(MOTION.position(0.0).tolist()))
     begin = RATE // 2
     node = first_node(samples[:begin], prior, -GRAVITY[2], at_rest=True)
-    filter = LateFilter(FilterConfig(errors=SensorErrors(clocks=(("wrong", 0.1),))), node)
+    filter = ErrorStateFilter(FilterConfig(errors=SensorErrors(clocks=(("wrong", 0.1),))), node)
     rng = np.random.default_rng(1)
     for k in range(begin, len(t)):
         filter.feel(samples[k])
@@ -78,7 +78,7 @@ def test_an_unknown_offset_is_found(kind: str, offset: float) -> None:
 def test_an_offset_that_nothing_tells_of_keeps_its_sigma() -> None:
     samples = [Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE) for k in range(3)]
     node = first_node(samples, Prior(heading=0.0), -GRAVITY[2], at_rest=True)
-    filter = LateFilter(FilterConfig(errors=SensorErrors(clocks=(("still", 0.1),))), node)
+    filter = ErrorStateFilter(FilterConfig(errors=SensorErrors(clocks=(("still", 0.1),))), node)
     for k in range(3, 100):
         filter.feel(Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE))
         rate = AngularRate(np.zeros(3), np.eye(3))

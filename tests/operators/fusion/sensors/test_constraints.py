@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from made_sensors import fused
+from operator_runs import assert_resumes_alike, firings_of
 
 from dataflow.messages import Imu, Message, Odometry, Pose
-from dataflow.operator import Context
 from operators.fusion import EkfFusion
 from operators.fusion.filter.error_state import Noise
 from operators.fusion.filter.history import Sample
@@ -125,28 +125,11 @@ def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
 
 
 @pytest.mark.long
-def test_two_plays_and_one_continued_from_a_snapshot_give_equal_bits() -> None:
-    velocity, tremble = walked(6.0, 4.0)
-    imu, poses, _ = readings(velocity, tremble)
+def test_restored_operator_resumes_alike() -> None:
+    imu, poses, _ = readings(*walked(6.0, 4.0))
     params: dict[str, Any] = {"heading": 0.0, "standstill": 0.1, "slip": 0.05, "sensors": {"robot/pose": {}}}
-    streams = {"robot/imu": imu, "robot/pose": poses}
-    assert fused(streams, **params)[1].digests() == fused(streams, **params)[1].digests()
-    one, other = EkfFusion(**params), EkfFusion(**params)
-    for operator in (one, other):
-        operator.setup()
-    firings: dict[int, dict[str, Message]] = {}
-    for name, messages in streams.items():
-        for message in messages:
-            firings.setdefault(message.stamp, {})[f"ns/{name}"] = message
-    rows = sorted(firings.items())
-    for stamp, given in rows[:480]:
-        one.process(given, Context(stamp))
-    other.restore(one.snapshot())
-    for stamp, given in rows[480:]:
-        first, second = (o.process(given, Context(stamp)) for o in (one, other))
-        assert first is not None
-        assert second is not None
-        assert first["odometry"].digest() == second["odometry"].digest()
+    firings = firings_of({"robot/imu": imu, "robot/pose": poses})
+    assert_resumes_alike(lambda: EkfFusion(**params), firings, 480)
 
 
 @pytest.mark.parametrize("gap", [1, 2], ids=["too few readings", "readings that end"])
