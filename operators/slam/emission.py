@@ -15,12 +15,7 @@ from operators.slam.place import Place
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.sensor_model import Added
 
-LEVELS = {
-    Place.MAPPED: Level.OK,
-    Place.CORRECTED: Level.OK,
-    Place.SEARCHING: Level.WARN,
-    Place.ADRIFT: Level.WARN,
-}
+LEVELS = {Place.MAPPED: Level.OK, Place.CORRECTED: Level.OK, Place.SEARCHING: Level.WARN, Place.ADRIFT: Level.WARN}
 
 
 def corrections(

@@ -19,6 +19,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
 from operators.odometry.lidar.tracker import LidarTracker, Tracked, TrackerConfig
 from operators.odometry.tracking import Status
+from operators.status import counted_status
 
 _STAMPED = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 _LEVELS = {Status.PREDICTED: Level.WARN, Status.LOST: Level.ERROR}
@@ -158,12 +159,4 @@ class LidarOdometry(Operator):
 def _status(stamp: int, tracked: Tracked) -> Diagnostics:
     level = Level.WARN if len(tracked.blind) else _LEVELS.get(tracked.state, Level.OK)
     text = f"{tracked.state.value}: {tracked.reason}" if tracked.reason else tracked.state.value
-    return Diagnostics(
-        stamp=stamp,
-        names=("lidar_odometry",),
-        messages=(text,),
-        levels=np.array([level], np.uint8),
-        keys=("state", *tracked.counts),
-        values=(tracked.state.value, *(str(n) for n in tracked.counts.values())),
-        owners=np.zeros(1 + len(tracked.counts), np.int32),
-    )
+    return counted_status("lidar_odometry", stamp, text, level, {"state": tracked.state.value, **tracked.counts})

@@ -19,9 +19,8 @@ from operators.odometry.images import check_image
 from operators.odometry.keyframes import candidates, view_distance
 from operators.odometry.mono.initialisation import first_map
 from operators.odometry.mono.map import MonoMap, View
-from operators.odometry.mono.pose import PosedView, refined, solved
+from operators.odometry.mono.pose import PosedView, recognised, refined, solved
 from operators.odometry.mono.ranging import MetricDepth, Ranged, RangingMemory, RangingUse, pose_at, ranged
-from operators.odometry.mono.relocalizer import recognised
 from operators.odometry.mono.scale import Scale
 from operators.odometry.mono.settings import MonoOdometryConfig
 from operators.odometry.mono.tracks import MonoFrame, Tracks, from_view, observe

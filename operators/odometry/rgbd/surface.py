@@ -106,10 +106,7 @@ class Surface:
         smooth_q = cv2.blur(q, (3, 3))
         c = smooth_q - a * x[None, :] - b * y[:, None]
         hole = cv2.dilate(
-            (q == 0).astype(np.uint8),
-            np.ones((3, 3), np.uint8),
-            borderType=cv2.BORDER_CONSTANT,
-            borderValue=(1,),
+            (q == 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(1,)
         )
         rough = np.abs(q - smooth_q) > 0.02 * smooth_q
         scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))

@@ -83,11 +83,7 @@ class StereoRelocalizer:
         self._made: dict[int, tuple[StereoKeyframe, float, Keyframe]] = {}
 
     def found(
-        self,
-        view: StereoKeyframe,
-        chosen: Sequence[StereoKeyframe],
-        known: Sequence[StereoKeyframe],
-        unit: float,
+        self, view: StereoKeyframe, chosen: Sequence[StereoKeyframe], known: Sequence[StereoKeyframe], unit: float
     ) -> Iterator[FoundAgain]:
         """Yields the poses of a view among chosen keyframes of those known that all that is seen makes sure of.
 

@@ -23,14 +23,7 @@ from scipy.linalg import solve_triangular
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Remembered
 from operators.estimation.chi_square import quantile
-from operators.slam.landmarks.association import (
-    Association,
-    Density,
-    agreed_pairs,
-    jointly_compatible,
-    nearest,
-    tight,
-)
+from operators.slam.landmarks.association import Association, Density, agreed_pairs, jointly_compatible, nearest, tight
 from operators.slam.landmarks.consistency import Consistency
 
 Array = NDArray[np.float64]
