@@ -48,7 +48,7 @@ class Turns:
 
     def errors(self, played: Played, *, relative: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         at = np.searchsorted(self.stamps, [m.stamp for m in played["oriented"]])
-        estimates = [m.orientation for m in played["oriented"]]  # type: ignore[attr-defined]
+        estimates = [m.orientation for m in played["oriented"]]
         difference = differences(estimates, self.truth.as_quat()[at])
         return errors(without_mean_heading(difference) if relative else difference)
 
@@ -70,7 +70,7 @@ def test_without_a_field_the_inclination_is_known_and_the_heading_relative() -> 
     assert np.degrees(heading.min()) > 30
     assert np.degrees(made.errors(played, relative=True)[0].max()) < 5
     assert len(total) == len(heading)
-    assert "no magnetic field" in played["status"][0].messages[0]  # type: ignore[attr-defined]
+    assert "no magnetic field" in played["status"][0].messages[0]
 
 
 def test_dropped_samples_are_bridged() -> None:
@@ -100,7 +100,7 @@ def test_what_is_not_finite_is_counted_and_survived() -> None:
     played = play(operator, {"imu": samples, "magnetic_field": fields})
     figures = operator.summary()
     assert figures["ignored, sample not finite"] == figures["ignored, field not finite or zero"] == 1
-    assert np.isfinite([m.orientation for m in played["oriented"]]).all()  # type: ignore[attr-defined]
+    assert np.isfinite([m.orientation for m in played["oriented"]]).all()
 
 
 def test_a_field_in_another_frame_is_an_error() -> None:

@@ -46,7 +46,7 @@ class Made:
     def filter(self, heading: float | None = 0.0, **config: object) -> ErrorStateFilter:
         prior = Prior(heading=heading, position_sigma=10.0)
         node = first_node(self.samples[:25], prior, 9.80665, at_rest=True)
-        return ErrorStateFilter(FilterConfig(**config), node)  # type: ignore[arg-type]
+        return ErrorStateFilter(FilterConfig(**config), node)
 
     def fed(self, filter: ErrorStateFilter, fixes: list[Measurement]) -> Array:
         """Gives all in the order of time; returns the errors of the position (N,) and their times."""
@@ -65,7 +65,6 @@ def ns(seconds: float) -> int:
 
 
 def displaced(fix: Measurement, by: Array) -> Measurement:
-    assert isinstance(fix.model, Position)
     return Measurement(fix.time, fix.sensor, Position(fix.model.value + by, np.zeros(3)), fix.noise)
 
 
@@ -187,7 +186,7 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
 
 
 @pytest.mark.long
-def test_headings_against_the_one_told_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
+def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
     rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
     samples = [
         Sample(ns(0.05 * k), 4e-3 * rng.standard_normal(3), still + 0.05 * rng.standard_normal(3), NOISE)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_walls import RATE, SIZE, K, aside, rendered
-from operator_runs import assert_one_calibration, assert_resumes_alike
+from operator_runs import assert_one_calibration, assert_resumes_alike, texts
 
 from dataflow.messages import CameraInfo, Image, Odometry, Transforms
 from dataflow.operator import Context
@@ -42,14 +42,10 @@ def run(given: dict[str, list[Any]], **params: Any) -> Played:
     return play(MonoVisualOdometry(**params), given, static=STATIC)
 
 
-def words(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
-
-
-def test_an_unknown_scale_is_said_in_the_message_itself() -> None:
+def test_message_of_an_unknown_scale_has_infinite_variance_and_its_own_frame() -> None:
     played = run(streams(16))
     poses: list[Any] = list(played["odometry"])
-    said = words(played)
+    said = texts(played)
     assert len(said) == 16
     assert len(poses) == sum(not text.startswith("initialising") for text in said)
     for pose in poses:
@@ -71,7 +67,7 @@ def test_wheels_give_metres_and_a_covariance() -> None:
     way = np.linalg.norm(poses[-1].position - poses[0].position)
     true = np.linalg.norm((truth[poses[-1].stamp] - truth[poses[0].stamp])[:3, 3])
     assert way == pytest.approx(float(true), rel=0.03)
-    assert "scale known to" in words(played)[-1]
+    assert "scale known to" in texts(played)[-1]
 
 
 def test_an_odometry_of_another_stamp_is_carried_to_the_image_by_its_velocity() -> None:
@@ -115,7 +111,7 @@ def test_fusion_takes_no_metres_from_poses_without_scale() -> None:
         fusion.process({"ns/mono/odometry": pose}, Context(pose.stamp))
     figures = fusion.summary()
     assert figures["ignored, mono/odometry: scale unknown"] == len(poses) - 1
-    assert figures["mono/odometry angular, used"] > 0  # type: ignore[operator]
+    assert figures["mono/odometry angular, used"] > 0
     assert "mono/odometry linear, used" not in figures
 
 

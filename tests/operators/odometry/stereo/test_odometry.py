@@ -69,7 +69,7 @@ def run(given: dict[str, list[Any]], **params: Any) -> Played:
 
 
 def words(played: Played) -> list[str]:
-    return [status.messages[0].split(":")[0] for status in played["status"]]  # type: ignore[attr-defined]
+    return [status.messages[0].split(":")[0] for status in played["status"]]
 
 
 def test_the_left_camera_is_followed_in_named_frames() -> None:
@@ -84,10 +84,10 @@ def test_the_left_camera_is_followed_in_named_frames() -> None:
     assert poses[-1].linear[0] == pytest.approx(10 * STEP, rel=0.2)
 
 
-def test_black_pairs_are_told_and_bridged() -> None:
+def test_black_pairs_are_reported_and_bridged() -> None:
     played = run(streams(12, black=range(6, 8)))
     assert words(played)[6:8] == ["predicted", "predicted"]
-    assert "black" in played["status"][6].messages[0]  # type: ignore[attr-defined]
+    assert "black" in played["status"][6].messages[0]
     assert words(played)[-1] in ("tracking", "relocalised")
     poses: list[Any] = list(played["odometry"])
     assert np.trace(poses[7].pose_covariance[:3, :3]) > np.trace(poses[5].pose_covariance[:3, :3])

@@ -43,7 +43,7 @@ def test_a_robot_that_drifted_by_the_distance_between_landmarks_is_placed_by_the
     assert abs(made.heading - true[2]) < 0.05
 
 
-def test_a_row_of_equal_distances_places_nobody() -> None:
+def test_a_row_of_equal_distances_does_not_relocalise() -> None:
     row = np.array([[x, 1.5] for x in np.arange(-4.0, 5.0)])
     made = LandmarkFilter()
     see(made, row, times=4)
@@ -98,7 +98,7 @@ def test_pairs_that_two_pairings_explain_alike_are_not_agreed() -> None:
     assert agreed_pairs(nearer[1::2], covariance[:4, :4], conflicts[1::2, 1::2], 0.01) == [0, 1]
 
 
-def test_odometry_noisier_than_told_is_reported_and_the_map_stays_whole() -> None:
+def test_odometry_noisier_than_its_covariance_is_reported_and_the_map_stays_whole() -> None:
     walk, told = Walk(3), np.diag([0.007**2, 0.0035**2, 0.0035**2])
     made = LandmarkFilter()
     states = set()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from operator_runs import assert_resumes_alike
+from operator_runs import assert_resumes_alike, errors_in_map, texts
 
 from dataflow.messages import PointCloud, Transforms
 from dataflow.messages.geometry import invert
@@ -50,18 +50,7 @@ def clouds(poses: Sequence[Matrix], room: str = "room", first: int = 0) -> list[
 
 
 def run(given: list[PointCloud], **params: object) -> Played:
-    return play(LidarSlam(**(NEAR | params)), {"cloud": given})  # type: ignore[arg-type]
-
-
-def texts(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]
-
-
-def errors(poses: Sequence, truth: Sequence[Matrix], origin: Matrix) -> NDArray[np.float64]:  # type: ignore[type-arg]
-    """Distance (m) of poses in the map from the truth, where the map's origin is known; no alignment."""
-    return np.array(
-        [np.linalg.norm((origin @ p.matrix())[:3, 3] - T[:3, 3]) for p, T in zip(poses, truth, strict=True)]
-    )
+    return play(LidarSlam(**(NEAR | params)), {"cloud": given})
 
 
 def elsewhere(count: int) -> list[Matrix]:
@@ -102,7 +91,7 @@ def test_a_place_seen_again_is_a_loop_and_the_map_does_not_grow_there(around: Pl
     assert not any(text.startswith("corrected") for text in told[: ROUND // 2])
     views = [int(s.values[s.keys.index("views")]) for s in around["status"]]
     assert views[-1] - views[ROUND - 1] <= 1
-    assert errors(around["pose"], on_round(ROUND + 5), on_round(1)[0]).max() < 0.03
+    assert errors_in_map(around["pose"], on_round(ROUND + 5), on_round(1)[0]).max() < 0.03
     assert len(around["path"]) > 0
     assert len(around["map"]) > 0
 
@@ -112,10 +101,10 @@ def test_poses_are_those_of_the_body_where_one_is_named() -> None:
     mount = at(0.3, 0.1, 0.4)
     extrinsics = Transforms.from_matrix(mount, stamp=0, frame="base_link", child_frame="lidar")
     given = {"cloud": clouds(on_round(ROUND + 4)), "extrinsics": [extrinsics]}
-    played = play(LidarSlam(body_frame="base_link", **NEAR), given, static=("extrinsics",))  # type: ignore[arg-type]
+    played = play(LidarSlam(body_frame="base_link", **NEAR), given, static=("extrinsics",))
     bodies = [T @ invert(mount) for T in on_round(ROUND + 4)]
     assert played["pose"][-1].child_frame == "base_link"
-    assert errors(played["pose"], bodies, bodies[0]).max() < 0.03
+    assert errors_in_map(played["pose"], bodies, bodies[0]).max() < 0.03
     walls = played["map"][-1].points @ bodies[0][:3, :3].T + bodies[0][:3, 3]
     assert np.quantile(np.abs(walls[:, 0]), 0.99) == pytest.approx(4.0, abs=0.1)  # half the room's length
 
@@ -202,7 +191,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     played = run(clouds(poses, first=60), map_file=str(saved))
     assert "corrected: the map is found" in texts(played)
     assert len(played["pose"]) >= 5
-    assert errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
+    assert errors_in_map(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
 
 
 @pytest.mark.long
@@ -229,25 +218,6 @@ def test_a_saved_map_has_the_same_bytes_each_time(tmp_path: Path) -> None:
     assert len(read_lidar_map(tmp_path / "a.npz")) > 2
 
 
-@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_map_is_refused(tmp_path: Path, content: bytes) -> None:
-    file = tmp_path / "wrong.npz"
-    file.write_bytes(content)
-    with pytest.raises(ValueError, match="is no LiDAR map"):
-        read_lidar_map(file)
-
-
-def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "new.npz", version=np.array(99))
-    with pytest.raises(ValueError, match="version 99"):
-        read_lidar_map(tmp_path / "new.npz")
-    np.savez(tmp_path / "cut.npz", version=np.array(1))
-    with pytest.raises(ValueError, match="damaged"):
-        read_lidar_map(tmp_path / "cut.npz")
-    with pytest.raises(FileNotFoundError):
-        LidarSlam(map_file=str(tmp_path / "none.npz")).setup()
-
-
 # -- bad scans, repeats --------------------------------------------------------------------------------------
 
 
@@ -259,7 +229,7 @@ def test_scans_that_tell_nothing_are_named_and_survived(points: NDArray[np.float
     played = run(given)
     assert texts(played)[7].startswith("adrift: odometry predicted: 0 usable points")
     assert texts(played)[-1].startswith("mapped")
-    assert errors(played["pose"], poses, poses[0])[-1] < 0.03
+    assert errors_in_map(played["pose"], poses, poses[0])[-1] < 0.03
 
 
 def test_nothing_but_empty_scans_gives_no_pose() -> None:
@@ -271,7 +241,7 @@ def test_nothing_but_empty_scans_gives_no_pose() -> None:
 
 @pytest.mark.long
 def test_restored_operator_resumes_alike() -> None:
-    assert_resumes_alike(lambda: LidarSlam(**NEAR), [(cloud,) for cloud in clouds(on_round(ROUND + 4))], ROUND - 3)  # type: ignore[arg-type]
+    assert_resumes_alike(lambda: LidarSlam(**NEAR), [(cloud,) for cloud in clouds(on_round(ROUND + 4))], ROUND - 3)
 
 
 @pytest.mark.long
@@ -279,7 +249,7 @@ def test_operator_restored_while_a_saved_map_is_searched_resumes_alike(saved: Pa
     firings = [(cloud,) for cloud in clouds(elsewhere(12), first=60)]
 
     def make() -> LidarSlam:
-        return LidarSlam(map_file=str(saved), **NEAR)  # type: ignore[arg-type]
+        return LidarSlam(map_file=str(saved), **NEAR)
 
     probe, searching = make(), 0
     probe.setup()
