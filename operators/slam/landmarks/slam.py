@@ -16,6 +16,7 @@ from dataflow.messages.geometry import invert, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.planar import PLANAR, flat, placed_in, planar
+from operators.localization.interpretation import cartesian
 from operators.slam.landmarks.association import Association
 from operators.slam.landmarks.filter import LandmarkFilter
 from operators.status import counted_status
@@ -156,7 +157,10 @@ class LandmarkSlam(Operator, merge=True):
 
     def _planar(self, sightings: LandmarkSightings, T_base_sensor: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Identities, positions (N, 2) and covariances (N, 2, 2) in the robot's frame, of what is usable."""
-        points, spread = _cartesian(sightings)
+        if sightings.covariances is None:
+            raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
+        points, spread = cartesian(sightings)
+        spread = spread[:, :2, :2]
         yaw = math.atan2(T_base_sensor[1, 0], T_base_sensor[0, 0])
         R = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         level = transform_points(T_base_sensor, points)[:, :2]
@@ -217,29 +221,6 @@ class LandmarkSlam(Operator, merge=True):
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
-
-
-def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
-    """Points (N, 3) in the sensor's frame and the covariances (N, 2, 2) of their x and y. Raises ValueError."""
-    if sightings.positions is not None:
-        flat = sightings.positions
-        points = np.column_stack([flat, np.zeros(len(flat))]) if flat.shape[1] == 2 else flat
-        if sightings.covariances is None:
-            raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
-        return points, sightings.covariances[:, :2, :2]
-    if sightings.ranges is None or sightings.bearings is None:
-        raise ValueError("sightings need positions, or ranges and bearings: one of the two does not say where it is")
-    if sightings.covariances is None:
-        raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
-    r, b = sightings.ranges, sightings.bearings
-    e = np.zeros_like(r) if sightings.elevations is None else sightings.elevations
-    r, b, e = (np.where(np.isfinite(one), one, np.nan) for one in (r, b, e))
-    level = r * np.cos(e)
-    points = np.column_stack([level * np.cos(b), level * np.sin(b), r * np.sin(e)])
-    J = np.empty((len(r), 2, 2))
-    J[:, 0, 0], J[:, 0, 1] = np.cos(e) * np.cos(b), -level * np.sin(b)
-    J[:, 1, 0], J[:, 1, 1] = np.cos(e) * np.sin(b), level * np.cos(b)
-    return points, J @ sightings.covariances[:, :2, :2] @ J.transpose(0, 2, 1)
 
 
 def _arc(step: Array, share: float) -> Array:
