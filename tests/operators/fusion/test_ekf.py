@@ -226,7 +226,7 @@ def test_fixes_without_altitude_count_horizontally_and_the_status_names_what_is_
     assert "height" in played["status"][-1].names
     assert any("altitude" in name for name in operator.summary())
     rows = np.searchsorted(robot.stamps, [m.stamp for m in made[-50:]])
-    off = np.array([m.position for m in made[-50:]]) - robot.T_world_base[rows, :3, 3]
+    off = np.array([m.position for m in made[-50:]]) - np.array(robot.T_world_base)[rows, :3, 3]
     assert np.linalg.norm(off[:, :2], axis=1).max() < 0.15
 
 
