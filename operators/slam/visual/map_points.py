@@ -70,7 +70,8 @@ class MapPoints(Remembered):
         matched = np.zeros(len(view.pixels), np.bool_)
         if len(rows):
             points = self.world(rows, nodes).astype(np.float32)
-            pairs = guided_pairs(points, self._rooted(rows, nodes), view, nodes[number].T, camera, WINDOW)
+            rooted = self._rooted(rows, nodes)
+            pairs = guided_pairs(points, rooted, view.pixels, view.rooted, nodes[number].T, camera, WINDOW)
             self._add(number, rows[pairs[:, 0]], pairs[:, 1], view)
             matched[pairs[:, 1]] = True
         if nodes[number].view is None:

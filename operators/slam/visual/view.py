@@ -161,7 +161,7 @@ def astray(noise: Noise) -> float:
 def _guided(
     known: View, seen: View, T_known_seen: Matrix, fitter: Fitter, window: float
 ) -> tuple[Sighting | None, int]:
-    pairs = guided_pairs(known.points, known.rooted, seen, T_known_seen, fitter.camera, window)
+    pairs = guided_pairs(known.points, known.rooted, seen.pixels, seen.rooted, T_known_seen, fitter.camera, window)
     return _solved(known, seen, pairs, fitter), len(pairs)
 
 
