@@ -10,11 +10,11 @@ from made_motion import Motion
 
 from dataflow.execution.snapshots import pack_state, unpack_state
 from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.gate import GateConfig
 from operators.fusion.filter.history import Sample
 from operators.fusion.filter.hypotheses import reduced
 from operators.fusion.filter.initialisation import Prior, first_node
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement, Position
 
 NOISE = Noise(gyro=2e-3, accel=2e-2, gyro_walk=1e-4, accel_walk=1e-3)
@@ -43,12 +43,12 @@ class Made:
             for x in self.t[26::5]
         ]
 
-    def filter(self, heading: float | None = 0.0, **config: object) -> LateFilter:
+    def filter(self, heading: float | None = 0.0, **config: object) -> ErrorStateFilter:
         prior = Prior(heading=heading, position_sigma=10.0)
         node = first_node(self.samples[:25], prior, 9.80665, at_rest=True)
-        return LateFilter(FilterConfig(**config), node)  # type: ignore[arg-type]
+        return ErrorStateFilter(FilterConfig(**config), node)
 
-    def fed(self, filter: LateFilter, fixes: list[Measurement]) -> Array:
+    def fed(self, filter: ErrorStateFilter, fixes: list[Measurement]) -> Array:
         """Gives all in the order of time; returns the errors of the position (N,) and their times."""
         waiting, rows = list(fixes), []
         for k in range(25, len(self.t)):
@@ -65,11 +65,10 @@ def ns(seconds: float) -> int:
 
 
 def displaced(fix: Measurement, by: Array) -> Measurement:
-    assert isinstance(fix.model, Position)
     return Measurement(fix.time, fix.sensor, Position(fix.model.value + by, np.zeros(3)), fix.noise)
 
 
-def bits(filter: LateFilter) -> list[bytes]:
+def bits(filter: ErrorStateFilter) -> list[bytes]:
     at, _ = filter.estimate(filter.time)
     return [getattr(at, name).tobytes() for name in ("position", "velocity", "rotation", "gyro_bias", "covariance")]
 
@@ -177,7 +176,7 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
     up = np.array([0.0, 0.0, 9.80665])
     samples = [Sample(k, np.zeros(3), up, Noise(1e-3, 1e-3, 0, 0)) for k in (-1, 0)]
     config = FilterConfig(inertial=False, unknown=Noise(0.0, 0.05, 0.05, 0.0))
-    filter = LateFilter(config, first_node(samples, prior, 9.80665, at_rest=False))
+    filter = ErrorStateFilter(config, first_node(samples, prior, 9.80665, at_rest=False))
     for k in range(1, 40):
         place = np.array([0.1 * k, -0.05 * k, 0.0])
         filter.measure(Measurement(k * 10**8, "fix", Position(place, np.zeros(3)), np.eye(3) * 0.01**2))
@@ -187,14 +186,14 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
 
 
 @pytest.mark.long
-def test_headings_against_the_one_told_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
+def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
     rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
     samples = [
         Sample(ns(0.05 * k), 4e-3 * rng.standard_normal(3), still + 0.05 * rng.standard_normal(3), NOISE)
         for k in range(600)
     ]
     node = first_node(samples[:20], Prior(heading=0.0, heading_sigma=0.05), 9.80665, at_rest=True)
-    filter = LateFilter(FilterConfig(), node)
+    filter = ErrorStateFilter(FilterConfig(), node)
     for k in range(20, 600):
         filter.feel(samples[k])
         if k % 20 == 0:

@@ -17,30 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.operator import Remembered
-from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import (
+    POSITION,
     ROTATION,
     SIZE,
     Noise,
     State,
     difference,
     mahalanobis,
+    moved,
     propagated,
     shifted,
     updated,
 )
-from operators.fusion.filter.far import bounded, brought, unplaced
-from operators.fusion.filter.gate import Doubt, GateConfig, Health, judge, leap, threshold
-from operators.fusion.filter.history import (
-    Entry,
-    Hypothesis,
-    Node,
-    Restart,
-    Sample,
-)
+from operators.fusion.filter.gate import PLACES, Doubt, GateConfig, Health, judge, leap, repeat_of, threshold
+from operators.fusion.filter.history import Command, Entry, Hypothesis, Node, Restart, Sample
 from operators.fusion.filter.hypotheses import combined, doubted, likely, moves, reduced, refuted, with_errors
 from operators.fusion.filter.measurements import Measurement
-from operators.fusion.filter.repeats import repeat_of
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.filter.suspicions import CHANCE, Suspicions
 
@@ -53,6 +46,10 @@ _YOUNG = 1e-3
 """Probability that a filter of less than a window's age differs so much from a fit by chance."""
 _MOMENT = 1e-3
 """Seconds over which the change of a prediction is taken."""
+FARTHEST = 1000.0
+"""Standard deviation of a first position, m: the room that is made for a place is no larger."""
+UNMEASURED = FARTHEST / 2
+"""Standard deviation of a coordinate (m) that nothing has measured yet: half of what it begins with."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class FilterConfig:
     biases: tuple[float, float] = (0.02, 0.2)
 
 
-class LateFilter(Remembered):
+class ErrorStateFilter(Remembered):
     """Takes inertial samples in order and measurements in any; several hypotheses until one has explained the rest."""
 
     ignored: Counter[str]
@@ -392,3 +389,27 @@ class LateFilter(Remembered):
 def _brought(hypotheses: Sequence[Hypothesis], found: Sequence[tuple[Array, Array]]) -> tuple[Hypothesis, ...]:
     """Returns the hypotheses, each moved to the place that was measured."""
     return tuple(replace(h, state=brought(h.state, r, H)) for h, (r, H) in zip(hypotheses, found, strict=True))
+
+
+# Places beyond what is expected: doubles do not hold a variance of (10⁷ m)², so the state is brought there first.
+
+
+def unplaced(state: State, kind: str) -> bool:
+    """Returns whether a measurement by a model of this name is the first that places the body."""
+    return kind in PLACES and bool((np.diag(state.covariance)[POSITION][:2] >= UNMEASURED**2).all())
+
+
+def brought(state: State, residual: Array, H: Array) -> State:
+    """Returns the state moved to the measured place, with the covariance that it had."""
+    error = np.zeros(len(state.covariance))
+    error[POSITION] = H[:, POSITION].T @ residual
+    return moved(state, error)
+
+
+def bounded(residual: Array, H: Array) -> tuple[Array, bool]:
+    """Returns the residual for which room is made, shortened to FARTHEST, and whether it was longer."""
+    places = H[:, POSITION].any(axis=1)
+    length = float(np.linalg.norm(residual[places]))
+    if length <= FARTHEST:
+        return residual, False
+    return np.where(places, residual * (FARTHEST / length), residual), True
