@@ -1,7 +1,7 @@
 """Drives an operator by its recorded firings.
 
 They say which messages each call was given, so nothing is decided again: drops, timeouts, lateness and restarts of a
-live run are repeated exactly. A `Judge` compares what comes out, digest by digest.
+live run are repeated exactly. A `Comparator` compares what comes out, digest by digest.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 from dataflow.environments import imported_packages, installed, require_environment
 from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
+from dataflow.execution.comparator import Comparator
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.generators.seeding import VERSION
-from dataflow.execution.judge import Judge
 from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
@@ -69,7 +69,7 @@ class RecordedRunner(Runner):
         self._watcher = watcher or Watcher()
         self.effects = RecordedJournal(make=make_effects)
         self.calls = Calls(node, self.operator, seed, version=seeding, effects=self.effects)
-        self.judge = Judge(node.name, tuple(self.ports.states), inputs)
+        self.comparator = Comparator(node.name, tuple(self.ports.states), inputs)
         self._repetition = repetition
         self.result.began = self._repetition.began
         self.result.unknown, self.result.lost_records = self._repetition.unknown, self._repetition.lost
@@ -90,7 +90,7 @@ class RecordedRunner(Runner):
     @property
     def result(self) -> Verification:
         """Returns what re-execution has come to so far."""
-        return self.judge.result
+        return self.comparator.result
 
     @property
     def next_record(self) -> FiringRecord | None:
@@ -102,11 +102,11 @@ class RecordedRunner(Runner):
         self._watcher.begins("setup", self.node.name)
         statics = self.calls.setup()
         if (record := self._repetition.setup) is not None:
-            self.judge.files(record, self.operator.files)
+            self.comparator.files(record, self.operator.files)
             then = record.detail.get("packages", {})
-            self.judge.packages(then, {name: installed(name) for name in then} or imported_packages())
+            self.comparator.packages(then, {name: installed(name) for name in then} or imported_packages())
             self._look_at_code(record)
-            for name, message, seq in self.judge.outputs(record, statics):
+            for name, message, seq in self.comparator.outputs(record, statics):
                 self.ports.emit_as(name, message, seq, record.incarnation)
         self._take_up()
         self.ports.end_statics()
@@ -121,7 +121,7 @@ class RecordedRunner(Runner):
         if again:
             statics = self._make_anew(again[-1].incarnation)
             if again[-1].kind == "setup":
-                self.judge.statics(again[-1], statics)
+                self.comparator.statics(again[-1], statics)
             self._look_at_code(again[-1])
         self._change(changes, again[-1].incarnation if again else 0)
         if before and is_known(last := before[-1]):
@@ -145,7 +145,7 @@ class RecordedRunner(Runner):
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
         if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
-            self.judge.arrived(stream, entry)
+            self.comparator.arrived(stream, entry)
             self.aligner.push(stream, entry)
         if not self.awake:
             self.wake()
@@ -205,7 +205,7 @@ class RecordedRunner(Runner):
                 case "param" | "reset":
                     self._attempt(record)
                 case "snapshot":
-                    self.judge.state(record, self.calls.snapshot(place))
+                    self.comparator.state(record, self.calls.snapshot(place))
                 case "restore":
                     self._restore(record)
                 case "cut":
@@ -213,14 +213,14 @@ class RecordedRunner(Runner):
 
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
-        self.judge.statics(record, self._make_anew(record.incarnation))
+        self.comparator.statics(record, self._make_anew(record.incarnation))
         self._look_at_code(record)
 
     def _look_at_code(self, record: FiringRecord) -> None:
         """Notes code that is not as it was, unless what a reload has replaced runs."""
         if not self._as_it_was:
             then = code_in(record) or {}
-            self.judge.code(then, code_now(type(self.operator), then).digests)
+            self.comparator.code(then, code_now(type(self.operator), then).digests)
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
@@ -256,9 +256,9 @@ class RecordedRunner(Runner):
             else:
                 self.calls.reset(detail["input"], place)
         except RAISED as error:
-            self.judge.error(record, error)
+            self.comparator.error(record, error)
         else:
-            self.judge.error(record, None)
+            self.comparator.error(record, None)
 
     def _restore(self, record: FiringRecord) -> None:
         """A replay that began in the middle: with this state, or with one that is unavailable."""
@@ -296,7 +296,7 @@ class RecordedRunner(Runner):
         raise ParameterError("the parameters of a re-execution are the recorded ones")
 
     def _fire(self, firing: Firing, record: FiringRecord) -> None:
-        self.judge.given(record, firing)
+        self.comparator.given(record, firing)
         if record.detail.get("injected"):  # a fault that was tried out: the operator was not called
             self.result.verified += 1
             return
@@ -309,16 +309,16 @@ class RecordedRunner(Runner):
             if record.outcome == "error":
                 self.ports.check(messages, firing.stamp)
         except RAISED as error:
-            self.judge.error(record, error)
+            self.comparator.error(record, error)
             messages = {}
         else:
-            self.judge.error(record, None)
+            self.comparator.error(record, None)
         if watched and (what := self._guard.changed(self.node.name)):
             self.result.wrote = self.result.wrote or what
-        for name, message, seq in self.judge.outputs(record, messages):
+        for name, message, seq in self.comparator.outputs(record, messages):
             self.ports.emit_as(name, message, seq, record.incarnation)
         if "summary" in record.detail:
-            self.judge.summary(record, self.calls.summary((record.incarnation, record.stamp)))
+            self.comparator.summary(record, self.calls.summary((record.incarnation, record.stamp)))
         if self.effects.counts:
             self.result.effects = self.effects.summary()
         self.firings += record.kind != "finish"

@@ -39,9 +39,9 @@ from dataflow.recording.streams.facts import machine_facts
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
+from dataflow.supervision.links import Links
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import ProcessPlan
-from dataflow.supervision.rings import Rings
 from dataflow.transport import Bus, Fanout, reserve_endpoints
 from dataflow.transport.publisher import undeclare
 
@@ -333,9 +333,9 @@ class Stay:
         self._corrected = frozenset(label for label, process in processes.items() if corrected & {*process.nodes})
         gate = wanted["gate"]["label"]
         self._pipe.bounded = wanted["live"]
-        rings = Rings([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
-        stack.callback(rings.close)
-        given = take_descriptors(rings.handed(gate), wanted["gate"])
+        links = Links([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
+        stack.callback(links.close)
+        given = take_descriptors(links.handed(gate), wanted["gate"])
         fanout = Fanout(given.outgoing, pool_bytes=POOL_BYTES)
         stack.callback(fanout.close)
         inbox = Inbox(given.wake, given.incoming)
@@ -347,7 +347,7 @@ class Stay:
         apart = nurseries_of({label: process.env for label, process in processes.items()}, common)
         nursery = Nursery(common)
         boxes = Boxes(graph, processes, live=wanted["live"])
-        self._children = Children(nursery, apart, self._selector, rings, boxes, self._clock, self._feed, self._printed)
+        self._children = Children(nursery, apart, self._selector, links, boxes, self._clock, self._feed, self._printed)
         stack.callback(self._children.bury)
         self._say("", "ready", facts=machine_facts(common))
 

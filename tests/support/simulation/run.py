@@ -209,8 +209,8 @@ class Simulation:
             ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
             ("dataflow.transport.ring", "os"): system,
             ("dataflow.transport.fanout", "os"): SimpleNamespace(sched_yield=_nothing),  # greenlets need no core
-            (f"{supervision}.rings", "os"): system,
-            (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
+            (f"{supervision}.links", "os"): system,
+            (f"{supervision}.links", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
             ("dataflow.sinks.live_sink", "let_others_begin"): _nothing,
             (f"{process}.operator_process", "gc"): SimpleNamespace(freeze=lambda: None),  # processes end here
