@@ -26,8 +26,7 @@ from dataflow.cli.support.arguments import (
 from dataflow.cli.support.output import err, fail, friendly_errors, out, plural, say
 
 if TYPE_CHECKING:
-    from dataflow.client.playback import Steering
-    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.client.playback import ReplayBar, Steering
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.interop.clocks import Choice
     from dataflow.recording import Recorded
@@ -185,7 +184,7 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
 def _bar(steering: Steering) -> ReplayBar | None:
     """Finds what a playback bar moves, where a recording is played through the graph; None elsewhere."""
     from dataflow.client.attach import NotRunning
-    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.client.playback import ReplayBar
 
     try:
         standing = steering.ask(None)
