@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.environments import imported_packages, installed, require_environment
-from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
 from dataflow.execution.comparator import Comparator
 from dataflow.execution.effects.journal import RecordedJournal
@@ -20,6 +19,7 @@ from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.execution.restarts import close_quietly
+from dataflow.execution.runner import align_spec
 from dataflow.graph.code import code_now, stored_operator
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
@@ -80,7 +80,8 @@ class RecordedRunner(Runner):
         self._ahead = iter(self._repetition)
         self.record = self._repetition.setup
         """The record that is repeated now, or was last."""
-        self._next = next(self._ahead, None)
+        self.next_record = next(self._ahead, None)
+        """The record that is repeated next; None behind the last one."""
         self._inputs: FiringInputs | None = None
         """Of the next call, once it is its turn."""
         self.changed: dict[str, Any] = {}
@@ -91,11 +92,6 @@ class RecordedRunner(Runner):
     def result(self) -> Verification:
         """Returns what re-execution has come to so far."""
         return self.comparator.result
-
-    @property
-    def next_record(self) -> FiringRecord | None:
-        """The record that is repeated next; None behind the last one."""
-        return self._next
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
@@ -144,7 +140,7 @@ class RecordedRunner(Runner):
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
-        if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
+        if self.next_record is not None and not self.ended and self.aligner.takes(stream, entry):
             self.comparator.arrived(stream, entry)
             self.aligner.push(stream, entry)
         if not self.awake:
@@ -171,7 +167,7 @@ class RecordedRunner(Runner):
 
     def _make_next(self) -> bool:
         self._repeat_changes()
-        record = self._next
+        record = self.next_record
         if record is not None and self._inputs is None:
             self._inputs = record.firing()
         firing = None if self._inputs is None else self.aligner.take(self._inputs)
@@ -191,12 +187,12 @@ class RecordedRunner(Runner):
 
     def _advance(self) -> None:
         """Reads the next record."""
-        self._next, self._inputs = next(self._ahead, None), None
+        self.next_record, self._inputs = next(self._ahead, None), None
 
     def _repeat_changes(self) -> None:
         """Returns what happened to the operator between the last firing and the next, in its recorded order."""
-        while self._next is not None and self._next.kind not in CALLS:
-            self.record = record = self._next
+        while self.next_record is not None and self.next_record.kind not in CALLS:
+            self.record = record = self.next_record
             self._advance()
             place = (record.incarnation, record.stamp)
             match record.kind:
@@ -249,23 +245,23 @@ class RecordedRunner(Runner):
     def _attempt(self, record: FiringRecord) -> None:
         """Changes a parameter, or resets; compares what that raises."""
         place, detail = (record.incarnation, record.stamp), record.detail
+        error: BaseException | None = None
         try:
             if record.kind == "param":
                 self.changed[detail["name"]] = detail["value"]
                 self.calls.parameter(detail["name"], detail["value"], place)
             else:
                 self.calls.reset(detail["input"], place)
-        except RAISED as error:
-            self.comparator.error(record, error)
-        else:
-            self.comparator.error(record, None)
+        except RAISED as raised:
+            error = raised
+        self.comparator.error(record, error)
 
     def _restore(self, record: FiringRecord) -> None:
         """A replay that began in the middle: with this state, or with one that is unavailable."""
         state = record.detail["state"]
         if state is None:
             self.result.lost_records += self._calls_left
-            self._calls_left, self._next = 0, None
+            self._calls_left, self.next_record = 0, None
             self.aligner = RecordedAligner(self._align_spec, Uses())
             return
         self._take_over(state, record)
@@ -285,7 +281,7 @@ class RecordedRunner(Runner):
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp of the next firing, and the stream and number of the message that it waits for."""
         missing = self.aligner.missing()
-        stamp = None if self._next is None else self._next.stamp
+        stamp = None if self.next_record is None else self.next_record.stamp
         return stamp, {} if missing is None else {missing.stream: missing.seq}
 
     def needs_from(self) -> dict[str, tuple[int, int]]:

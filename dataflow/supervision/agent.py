@@ -42,7 +42,7 @@ from dataflow.supervision.core import events
 from dataflow.supervision.links import Links
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import ProcessPlan
-from dataflow.transport import Bus, Fanout, reserve_endpoints
+from dataflow.transport import Bus, Fanout, Reservation
 from dataflow.transport.publisher import undeclare
 
 HELLO_EVERY = 0.25
@@ -95,7 +95,7 @@ class Agent:
         self._folder.mkdir(parents=True, exist_ok=True)
         os.chdir(self._folder)
         with (
-            reserve_endpoints(1) as reserved,
+            Reservation(1) as reserved,
             contextlib.closing(router(reserved.endpoints, (self._endpoint,), more)) as bus,
         ):
             threading.Thread(target=self._greet, args=(bus,), name="hello", daemon=True).start()
@@ -341,7 +341,7 @@ class Stay:
         inbox = Inbox(given.wake, given.incoming)
         stack.callback(inbox.close)
         self._gate = self._gate_of(inbox, fanout, Routes.from_json(wanted["routes"]))
-        reserved = stack.enter_context(contextlib.closing(reserve_endpoints(len(processes))))
+        reserved = stack.enter_context(contextlib.closing(Reservation(len(processes))))
         self._endpoints = dict(zip(processes, reserved.endpoints, strict=True))
         common = environment(graph.threads)
         apart = nurseries_of({label: process.env for label, process in processes.items()}, common)

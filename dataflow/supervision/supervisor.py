@@ -31,7 +31,7 @@ from dataflow.supervision.early_nursery import EarlyNursery
 from dataflow.supervision.links import Links, Pairs, pairs_of
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import LINK, RECORDER, RunPlan, process_plans
-from dataflow.transport import registry, reserve_endpoints
+from dataflow.transport import Reservation, registry
 from dataflow.transport.log_file import LogFile
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Supervisor:
         self._early = early
         self._processes = process_plans(plan)
         labels = [*self._processes, *([LINK] if any(p.machine for p in self._processes.values()) else ())]
-        self._reserved = reserve_endpoints(len(labels))
+        self._reserved = Reservation(len(labels))
         self._endpoints = dict(zip(labels, self._reserved.endpoints, strict=True))
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))

@@ -220,7 +220,7 @@ class Simulation:
             (f"{supervision}.supervisor", "Console"): _Shown,
             (f"{supervision}.supervisor", "LogFile"): _NoLog,
             (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
-            (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
+            (f"{supervision}.supervisor", "Reservation"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "signal"): machine.Signals(system),
