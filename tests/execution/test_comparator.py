@@ -36,7 +36,7 @@ def test_a_call_that_raises_without_an_output_is_a_difference() -> None:
 
 
 @pytest.mark.parametrize(("made", "same"), [((1.0, 0.0, 2.0), True), ((1.0, 0.0, 3.0), False), ((1.0, 2.0), False)])
-def test_what_was_made_in_all_calls_is_told_apart(made: tuple[float, ...], same: bool) -> None:
+def test_digest_distinguishes_the_outputs_of_all_calls(made: tuple[float, ...], same: bool) -> None:
     assert (judged(1.0, 0.0, 2.0).differences == judged(*made).differences) is same
 
 
@@ -44,7 +44,7 @@ def test_nothing_differs_where_all_is_as_recorded() -> None:
     assert judged(0.0, 0.0).differences == ""
 
 
-def test_messages_that_the_run_did_not_make_are_told_apart() -> None:
+def test_digest_distinguishes_messages_that_the_run_did_not_make() -> None:
     found = []
     for value in (1.0, 2.0):
         comparator = Comparator("x", ("out",), {})
