@@ -52,8 +52,8 @@ class HubConfig:
     routes: Mapping[str, Any]
     graph: Mapping[str, Any]
     live: bool
-    rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
-    rings_in: Sequence[Sequence[str]] = ()
+    links_out: Sequence[tuple[bool, Sequence[str]]] = ()
+    links_in: Sequence[Sequence[str]] = ()
     life: int = 1
 
 

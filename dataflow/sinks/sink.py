@@ -42,7 +42,7 @@ DRAIN_WITHIN = 5.0
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
     """Configuration of a sink process, from its supervisor: `kind` is "record" or "view", `options` belong to the
-    kind, `rings_in` are the keys of each link from another process, `life` counts the processes in its place."""
+    kind, `links_in` are the keys of each link from another process, `life` counts the processes in its place."""
 
     label: str
     kind: str
@@ -50,7 +50,7 @@ class SinkConfig:
     streams: list[str]
     firings: list[str]
     options: dict[str, Any]
-    rings_in: Sequence[Sequence[str]] = ()
+    links_in: Sequence[Sequence[str]] = ()
     live: bool = False
     life: int = 1
 

@@ -176,7 +176,7 @@ def test_a_replay_from_the_middle_goes_on_with_the_state_of_then(tmp_path: Path)
         assert recording["count"]["value"].tolist() == [4.0, 5.0, 6.0]
 
 
-def test_progress_is_told_while_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_reported_while_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.api.local.SHOW_EVERY", 0.0)
     seen: list[Status] = []
     watch().run(watch=seen.append)

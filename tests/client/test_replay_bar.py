@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dataflow.client.attach import NotRunning
-from dataflow.client.replay_bar import ReplayBar
+from dataflow.client.playback import ReplayBar
 
 FIRST = 1_700_000_000 * 10**9
 

@@ -214,7 +214,7 @@ def test_what_no_firing_makes_gives_its_stamp_and_frame(operator: Operator, mess
         play(operator, None if isinstance(operator, Source) else {"number": [Number(stamp=1, value=0)]})
 
 
-def test_a_call_without_a_runner_leaves_them_out_and_says_so() -> None:
+def test_call_without_runner_leaves_stamp_and_frame_unset() -> None:
     made = Unframed().process(Number(stamp=1, value=0))
     assert made.position.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match=r"Point has no frame: .* when process\(\) returns the message"):

@@ -95,14 +95,7 @@ def again(ran: Collector, body: Body | None = None, **options: Any) -> RecordedR
     asking = node(Asking, {"x": [STREAM]})
     repetition = Repetition(lambda: ran.records, stateless=asking.operator.stateless)
     look_at([repetition])
-    runner = RecordedRunner(
-        asking,
-        Collector(),
-        static=frozenset(),
-        repetition=repetition,
-        inputs=inputs,
-        **options,
-    )
+    runner = RecordedRunner(asking, Collector(), static=frozenset(), repetition=repetition, inputs=inputs, **options)
     runner.setup()
     for message in MESSAGES:
         runner.push(STREAM, message)

@@ -94,7 +94,7 @@ def test_a_draw_after_a_draw_is_seeded_anew() -> None:
     assert drawn[0] == drawn[1]
 
 
-def test_the_generator_is_seeded_at_once_where_somebody_has_its_c_functions() -> None:
+def test_generator_is_seeded_at_once_where_another_module_holds_its_c_functions() -> None:
     random.random()  # whatever was pending is no more
     held = random.random
     random.seed(3)

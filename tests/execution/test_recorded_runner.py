@@ -126,12 +126,7 @@ def restarted_run(made: Node, messages: Iterable[Entry], changes: int) -> Collec
     errors = iter([None, Fails("once"), None])
     faults: Any = SimpleNamespace(before=lambda firing: next(errors, None))
     runner = LiveRunner(
-        made,
-        collector,
-        static=frozenset(),
-        event_clock=lambda: 10**6,
-        faults=faults,
-        snapshots=StateSpacing(1),
+        made, collector, static=frozenset(), event_clock=lambda: 10**6, faults=faults, snapshots=StateSpacing(1)
     )
     runner.setup()
     for number, message in enumerate(messages):

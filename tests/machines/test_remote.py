@@ -15,9 +15,9 @@ from dataflow.graph import load_text
 from dataflow.machines import files
 from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
+from dataflow.supervision.links import pairs_of
 from dataflow.supervision.plan import LINK, Meeting, RunPlan, process_plans
 from dataflow.supervision.remote import PIECES_ON_THE_WAY, Remote
-from dataflow.supervision.rings import pairs_of
 
 sys.path.append(str(HERE))
 GRAPH = """\

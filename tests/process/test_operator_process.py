@@ -217,14 +217,15 @@ def test_a_source_is_not_closed_while_its_stream_is_read(blocked: OneProcess) ->
 
     blocked.process.close()
 
-    assert [what for what, _ in process_operators.Blocks.ends] == ["stream", "close"]
+    assert process_operators.Blocks.ends == [("stream", "source camera"), ("close", "MainThread")]
 
 
 def test_a_source_whose_stream_does_not_return_is_not_closed_at_all(
-    blocked: OneProcess, monkeypatch: pytest.MonkeyPatch
+    blocked: OneProcess, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(live_sources, "RETURN_WITHIN", 0.05)
 
     blocked.process.close()
 
     assert process_operators.Blocks.ends == []
+    assert "source 'camera' did not return within 0.05 s: close() is not called" in capsys.readouterr().err

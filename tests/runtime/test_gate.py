@@ -13,15 +13,7 @@ from dataflow.records.comparison import Difference, Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.gate import (
-    Baseline,
-    BaselineError,
-    Checked,
-    Judged,
-    check,
-    judge,
-    recordings_in,
-)
+from dataflow.verification.gate import Baseline, BaselineError, Checked, Judged, check, judge, recordings_in
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.stored import StoredStream
 
@@ -307,7 +299,7 @@ def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Excepti
     assert not one.passed
 
 
-def test_an_operators_traceback_is_told_from_the_runtimes_own() -> None:
+def test_operator_traceback_is_distinguished_from_that_of_the_runtime() -> None:
     def failing(operator: str | None) -> Checked:
         def verify(path: Path) -> VerifyReport:
             raise RunFailed("it failed", "Traceback (most recent call last)", operator)

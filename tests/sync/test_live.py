@@ -21,16 +21,11 @@ from dataflow.sync import (
     refs_of,
 )
 
-from .scenarios import HORIZON, Repeater, Scenario, Step, entries, interleave, poll_all, run, scenarios, tell
+from .scenarios import HORIZON, Repeater, Scenario, Step, entries, interleave, poll_all, push, run, scenarios, tell
 
 A = TriggerSpec("a", ("a",))
 B = TriggerSpec("b", ("b",))
 seeds = st.integers(0, 2**32 - 1)
-
-
-def push(aligner: Aligner, stream: str, *stamps: int) -> None:
-    for entry in entries(stream, *stamps):
-        aligner.push(stream, entry)
 
 
 def stamps(firings: list[Firing]) -> list[int]:

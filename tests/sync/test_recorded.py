@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dataflow.sync import (
-    AlignSpec,
-    Entry,
-    FiringInputs,
-    MessageRef,
-    RecordedAligner,
-    SampledSpec,
-    TriggerSpec,
-    Uses,
-)
+from dataflow.sync import AlignSpec, Entry, FiringInputs, MessageRef, RecordedAligner, SampledSpec, TriggerSpec, Uses
 
 SPEC = AlignSpec((TriggerSpec("x", ("x",)),), (SampledSpec("map", ("map",)),))
 MAP = MessageRef("map", 0, 0)

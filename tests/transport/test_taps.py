@@ -58,7 +58,7 @@ def test_a_tap_gets_the_streams_it_named_in_order(
         eventually(lambda: server.active)
         for seq in range(20):
             server.offer(DEPTH, envelope(seq))
-            server.offer(SCAN, encode(envelope(seq, SCAN)))
+            server.offer(SCAN, envelope(seq, SCAN))
         assert taken(client) == [(DEPTH, seq) for seq in range(20)]
         assert client.skipped == 0
     eventually(lambda: not server.active)

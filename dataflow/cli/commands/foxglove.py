@@ -27,8 +27,7 @@ from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import err, fail, out, plural, say
 
 if TYPE_CHECKING:
-    from dataflow.client.playback import Steering
-    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.client.playback import ReplayBar, Steering
     from dataflow.foxglove.server import Controls, FoxgloveServer
     from dataflow.recording import Recorded
 
@@ -170,7 +169,7 @@ def _follow(options: FoxgloveOptions) -> None:
 def _bar(steering: Steering) -> ReplayBar | None:
     """Finds what a playback bar moves, where a recording is played through the graph; None elsewhere."""
     from dataflow.client.attach import NotRunning
-    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.client.playback import ReplayBar
 
     try:
         standing = steering.ask(None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from dataflow.execution.ready import Ready
+from dataflow.execution.driver import Ready
 from simulation.world import Violation, World
 
 

@@ -20,11 +20,9 @@ from dataflow.sync.entries import entries_of
 _ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
 
 
-class Judge:
-    """Compares what one operator does with its records, and keeps the result.
-
-    A difference is the operator's own when everything that it was given until then is known to be as recorded.
-    """
+class Comparator:
+    """Compares what one operator does with its records, and keeps the result. A difference is the operator's own when
+    everything that it was given until then is known to be as recorded."""
 
     def __init__(self, operator: str, ports: tuple[str, ...], inputs: Digests) -> None:
         self.result = Verification(operator)

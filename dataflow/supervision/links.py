@@ -43,7 +43,7 @@ def gate_of(machine: str | None) -> str:
     return LINK if machine is None else f"{LINK} {machine}"
 
 
-class Rings:
+class Links:
     """The memory and the eventfds of all links. Raises `OSError` when there are too many."""
 
     def __init__(self, labels: list[str], pairs: Pairs) -> None:

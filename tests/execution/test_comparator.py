@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dataflow.execution.judge import Judge
+from dataflow.execution.comparator import Comparator
 from dataflow.messages import Number
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import Emission, FiringRecord
@@ -12,13 +12,13 @@ from dataflow.records.firing import Emission, FiringRecord
 
 def judged(*made: float | None, error: str = "") -> Verification:
     """What comparing calls shows that made 0.0 in the run: `made` instead, or nothing, with an error."""
-    judge = Judge("x", ("out",), {})
+    comparator = Comparator("x", ("out",), {})
     for index, value in enumerate(made):
         then = Number(stamp=index, value=0.0)
         record = FiringRecord("x", 0, index, "fire", index, outputs=(Emission(index, index, then.digest()),))
-        judge.error(record, RuntimeError(error) if error else None)
-        list(judge.outputs(record, {} if value is None else {"out": Number(stamp=index, value=value)}))
-    return judge.result
+        comparator.error(record, RuntimeError(error) if error else None)
+        list(comparator.outputs(record, {} if value is None else {"out": Number(stamp=index, value=value)}))
+    return comparator.result
 
 
 def test_a_call_that_raises_in_place_of_its_output_is_one_difference() -> None:
@@ -28,15 +28,15 @@ def test_a_call_that_raises_in_place_of_its_output_is_one_difference() -> None:
 
 
 def test_a_call_that_raises_without_an_output_is_a_difference() -> None:
-    judge = Judge("x", ("out",), {})
+    comparator = Comparator("x", ("out",), {})
 
-    judge.error(FiringRecord("x", 0, 0, "fire", 0, outputs=(None,)), RuntimeError("no"))
+    comparator.error(FiringRecord("x", 0, 0, "fire", 0, outputs=(None,)), RuntimeError("no"))
 
-    assert judge.result.differing == 1
+    assert comparator.result.differing == 1
 
 
 @pytest.mark.parametrize(("made", "same"), [((1.0, 0.0, 2.0), True), ((1.0, 0.0, 3.0), False), ((1.0, 2.0), False)])
-def test_what_was_made_in_all_calls_is_told_apart(made: tuple[float, ...], same: bool) -> None:
+def test_digest_distinguishes_the_outputs_of_all_calls(made: tuple[float, ...], same: bool) -> None:
     assert (judged(1.0, 0.0, 2.0).differences == judged(*made).differences) is same
 
 
@@ -44,11 +44,15 @@ def test_nothing_differs_where_all_is_as_recorded() -> None:
     assert judged(0.0, 0.0).differences == ""
 
 
-def test_messages_that_the_run_did_not_make_are_told_apart() -> None:
+def test_digest_distinguishes_messages_that_the_run_did_not_make() -> None:
     found = []
     for value in (1.0, 2.0):
-        judge = Judge("x", ("out",), {})
-        list(judge.outputs(FiringRecord("x", 0, 0, "fire", 0, outputs=(None,)), {"out": Number(stamp=0, value=value)}))
-        found.append(judge.result.differences)
+        comparator = Comparator("x", ("out",), {})
+        list(
+            comparator.outputs(
+                FiringRecord("x", 0, 0, "fire", 0, outputs=(None,)), {"out": Number(stamp=0, value=value)}
+            )
+        )
+        found.append(comparator.result.differences)
 
     assert found[0] != found[1]

@@ -14,8 +14,8 @@ import pytest
 from dataflow.graph import Graph, load_text
 from dataflow.process.descriptors import Descriptors, take_descriptors
 from dataflow.supervision.configs import configurations
+from dataflow.supervision.links import Links, pairs_of
 from dataflow.supervision.plan import RunPlan, process_plans
-from dataflow.supervision.rings import Rings, pairs_of
 
 GRAPH = """\
 graph: robot
@@ -82,10 +82,10 @@ def test_shared_configuration_is_computed_once(monkeypatch: pytest.MonkeyPatch) 
 def opened(made: RunPlan) -> Iterator[Mapping[str, Descriptors]]:
     """What each process of a run is handed, opened as it would open it."""
     processes = process_plans(made)
-    rings = Rings(list(processes), pairs_of(made.graph, processes))
+    links = Links(list(processes), pairs_of(made.graph, processes))
     configs = configurations(made, processes, dict.fromkeys(processes, "unixsock-stream//nowhere"))
-    yield {label: take_descriptors(rings.handed(label), configs[label][1]) for label in processes}
-    rings.close()
+    yield {label: take_descriptors(links.handed(label), configs[label][1]) for label in processes}
+    links.close()
 
 
 def test_what_one_end_of_a_link_sends_arrives_at_the_other() -> None:
@@ -113,7 +113,7 @@ def test_only_operators_of_a_live_run_may_miss_what_they_do_not_take(live: bool,
 
 def test_too_many_links_are_closed_with_the_rest() -> None:
     before = len(os.listdir("/proc/self/fd"))
-    rings = Rings(["a", "b"], {("a", "b"): ("x",)})
+    links = Links(["a", "b"], {("a", "b"): ("x",)})
     assert len(os.listdir("/proc/self/fd")) == before + 4
-    rings.close()
+    links.close()
     assert len(os.listdir("/proc/self/fd")) == before
