@@ -126,7 +126,7 @@ def test_mistakes_are_those_of_the_graph_language() -> None:
     with pytest.raises(ValueError, match="there is an operator 'meter' already"):
         watch().add("meter", Photometer)
     with pytest.raises(TypeError, match=r"parameters are keywords"):
-        dataflow.Graph().add("camera", Camera())  # type: ignore[arg-type]
+        dataflow.Graph().add("camera", Camera())
     with pytest.raises(TypeError, match="has no place in a graph"):
         dataflow.Graph().add("camera", Camera, frames=object())
 

@@ -208,7 +208,7 @@ def test_strict_counts_for_a_viewer_file_too(dataflow, odd: Path, tmp_path: Path
 
 def test_every_option_of_the_help_is_among_those_tried() -> None:
     group = get_command(app)
-    command = group.get_command(Context(group), "convert")  # type: ignore[attr-defined]
+    command = group.get_command(Context(group), "convert")
     offered = {option for p in command.params for option in p.opts if option.startswith("--") and option != "--help"}
     described = set(re.findall(r"--to ([\w-]+)", convert.__doc__ or ""))
 
@@ -237,7 +237,7 @@ def written(path: Path, times: Iterable[int]) -> Path:
         rows = imus([START + k * SECOND // 100 for k in range(len(stamps))])
         for time, (_, _, message) in zip(stamps, rows, strict=True):
             writer.add_message(channel, time, bytes(ROS2.serialize_cdr(message, kind.name)), time)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path
 
 

@@ -179,7 +179,7 @@ def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
         assert watch is not None
         watch(Status("running", operators={"smooth": OperatorCounts(3)}))
 
-    assert console.file.getvalue().split() == ["running", "3", "firings"]  # type: ignore[attr-defined]
+    assert console.file.getvalue().split() == ["running", "3", "firings"]
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -190,7 +190,7 @@ def test_notes_are_printed_as_they_come_each_once_and_not_those_of_the_end(quiet
         watch(status)
         status.notes.append("source 'robot' has fallen behind the clock: reading it takes longer than real time")
         watch(status)
-        at_once = console.file.getvalue()  # type: ignore[attr-defined]
+        at_once = console.file.getvalue()
         watch(status)
         status.phase = "closing"
         status.notes.append("source 'robot' was 15.0 s behind the clock at the end, 16.0 s at most")
@@ -198,13 +198,13 @@ def test_notes_are_printed_as_they_come_each_once_and_not_those_of_the_end(quiet
 
     note = "note: source 'robot' has fallen behind the clock: reading it takes longer than real time"
     assert note in at_once.splitlines()
-    whole = console.file.getvalue()  # type: ignore[attr-defined]
+    whole = console.file.getvalue()
     assert whole.count("behind the clock") == 1
 
 
 def text_of(console: Console) -> list[str]:
     """The lines that were printed."""
-    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
 
 
 def lossy_report() -> RunReport:
@@ -255,7 +255,7 @@ def test_a_report_without_losses_has_no_columns_for_them() -> None:
 
     print_report(console, replace(report, operators=counts, drops={}, waits={}), verbose=True)
 
-    told = console.file.getvalue()  # type: ignore[attr-defined]
+    told = console.file.getvalue()
     assert "dropped" not in told
     assert "timeout" not in told
 
@@ -392,7 +392,7 @@ def test_start_names_processes_it_waits_for() -> None:
         watch(status)
 
     waiting = "starting waiting for camera, cloud, detector and 2 more"
-    assert " ".join(console.file.getvalue().split()) == waiting  # type: ignore[attr-defined]
+    assert " ".join(console.file.getvalue().split()) == waiting
 
 
 def test_a_line_break_in_a_name_makes_no_row() -> None:
@@ -402,6 +402,6 @@ def test_a_line_break_in_a_name_makes_no_row() -> None:
 
     console.print(made)
 
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    lines = console.file.getvalue().splitlines()
     assert [line for line in lines if "forged" in line] == [line for line in lines if "imu" in line]
     assert any("3\\n4" in line for line in lines)

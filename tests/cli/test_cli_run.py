@@ -188,7 +188,7 @@ def started(*words: object, folder: Path | None = None) -> subprocess.Popen[str]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(PACKAGE / "tests" / "runtime")])}
     command = [sys.executable, "-m", "dataflow.cli.main", *map(str, words)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, cwd=folder, env=env, text=True, **pipes)  # type: ignore[call-overload]
+    return subprocess.Popen(command, cwd=folder, env=env, text=True, **pipes)
 
 
 def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -> None:

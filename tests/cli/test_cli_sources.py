@@ -49,7 +49,7 @@ def poses(
             data = json.dumps({"timestamp": stamp, "frame_id": "map", "pose": place}).encode()
             writer.add_message(pose, time, text if i == bad else data, time, i)
             writer.add_message(other, time, b'{"number": %d, "text": "%s"}' % (i, b"abcdefgh" * 10), time, i)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path
 
 
@@ -312,7 +312,7 @@ def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Pat
             for k in range(3):
                 data = b"\xff\xff\xff\x7f" if k == 1 else struct.pack("<I", 2) + b"hi"
                 writer.add_message(channel, START + k * SECOND, data, START + k * SECOND, k)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
 
     told = json.loads(dataflow("convert", path, tmp_path / "bag", "--to", "ros2", "--json").stdout)
 

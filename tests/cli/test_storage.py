@@ -61,7 +61,7 @@ def test_a_limit_of_the_disk_splits_by_a_tenth_of_it(capsys: pytest.CaptureFixtu
 )
 def test_options_of_a_recording_need_one(name: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit):
-        RecordOptions(**{name: value}).storage()  # type: ignore[arg-type]
+        RecordOptions(**{name: value}).storage()
     assert f"--{name.replace('_', '-')} is of a recording" in capsys.readouterr().err
 
 

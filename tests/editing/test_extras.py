@@ -56,7 +56,7 @@ def held(path: Path) -> Extras:
     """What the mcap library reads, by the summary."""
     with path.open("rb") as file:
         reader = make_reader(file)
-        statistics = reader.get_summary().statistics  # type: ignore[union-attr]
+        statistics = reader.get_summary().statistics
         found = [(a.name, a.media_type, a.log_time, a.create_time, a.data) for a in reader.iter_attachments()]
         records = [(m.name, dict(m.metadata)) for m in reader.iter_metadata()]
     assert statistics is not None
@@ -180,7 +180,7 @@ def test_a_torn_file_gives_the_attachments_that_are_whole(tmp_path: Path) -> Non
     Attachment(0, 0, "late", "text/plain", b"x" * 100).write(record)
     at = data.index(b"calibration.yaml")
     torn = tmp_path / "torn.mcap"
-    torn.write_bytes(data[: data.index(struct.pack("<B", Opcode.DATA_END), at + 60)] + bytes(record.end())[:50])  # type: ignore[no-untyped-call]
+    torn.write_bytes(data[: data.index(struct.pack("<B", Opcode.DATA_END), at + 60)] + bytes(record.end())[:50])
 
     saved = recover(torn, tmp_path / "saved.mcap")
     assert saved.torn

@@ -107,7 +107,7 @@ def test_each_part_of_a_run_reads_little_more_than_its_own_records() -> None:
         read[0], each = 0, 8192 // parts
         for k in range(parts):
             start, end = k * each + 1, (k + 1) * each
-            found = run.of_span({"test/left/fast"}, start, end, lambda _, span=(start, end): span)  # type: ignore[misc]
+            found = run.of_span({"test/left/fast"}, start, end, lambda _, span=(start, end): span)
             assert sum(record.kind == "fire" for record in found.records["left"]) == each
         counts.append(read[0])
     assert counts[1] < 2 * counts[0]

@@ -170,7 +170,7 @@ def test_a_message_that_is_kept_has_its_stamp_at_the_next_firing_and_in_snapshot
     played = play(operator, {"number": [Number(stamp=3, value=1), Number(stamp=8, value=1)]})
     assert [n.value for n in played["pace"]] == [0, 5]
     later = Keeping()
-    later.restore(operator.snapshot())  # type: ignore[arg-type]
+    later.restore(operator.snapshot())
     assert later.state.last == Number(stamp=8, value=1)
 
 

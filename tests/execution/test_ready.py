@@ -75,7 +75,7 @@ class Listed:
             if self.until[number] is None:
                 self.noted.pop(number, None)
             else:
-                self.noted[number] = when  # type: ignore[assignment]
+                self.noted[number] = when
         return worked
 
     def next_due(self, now: float) -> float | None:

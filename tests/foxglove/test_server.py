@@ -160,7 +160,7 @@ def test_the_playback_bar_moves_the_clock() -> None:
 
 def test_a_refused_seek_moves_nothing_and_is_reported() -> None:
     class Fixed(Clock):
-        def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:  # type: ignore[override]
+        def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:
             return "no jumps here" if seek is not None else None
 
     clock = Fixed(STAMP, STAMP + 10**10)

@@ -106,7 +106,7 @@ def test_a_file_resolves_to_streams_parameters_and_policies(tmp_path: Path) -> N
         ("cloud", "image"),
         ("detector", "image"),
     ]
-    assert graph.nodes["cloud"].make().stride == 4  # type: ignore[attr-defined]
+    assert graph.nodes["cloud"].make().stride == 4
 
 
 def test_processes_follow_process_labels_unless_overridden() -> None:

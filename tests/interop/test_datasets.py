@@ -72,7 +72,7 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert np.allclose([row["timestamp"] for row in rows], np.arange(5) / 10)
     picture = rows[0]["observation.images.camera.image"]["bytes"]
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
-    assert np.array_equal(decoded, streams_of["camera/image"][1].data)  # type: ignore[attr-defined]
+    assert np.array_equal(decoded, streams_of["camera/image"][1].data)
     assert set(info["features"]) == set(table.column_names)
     assert info["features"]["observation.images.camera.image"]["shape"] == [12, 16, 3]
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
@@ -231,13 +231,13 @@ def test_a_kitti_raw_drive_is_read_back_by_its_reader(tmp_path: Path) -> None:
     assert len(steps) == 4
     for step, image, scan in zip(steps, streams["camera/image"], streams["lidar/points"], strict=False):
         assert step["points"].stamp == scan.stamp
-        assert np.array_equal(step["points"].points, scan.points)  # type: ignore[attr-defined]
-        assert np.array_equal(step["points"].intensities, scan.intensities)  # type: ignore[attr-defined]
-        assert np.array_equal(step["image"].data, image.data)  # type: ignore[attr-defined]
+        assert np.array_equal(step["points"].points, scan.points)
+        assert np.array_equal(step["points"].intensities, scan.intensities)
+        assert np.array_equal(step["image"].data, image.data)
     placed = static["extrinsics"]
-    assert np.allclose(placed.translations, [[0.1, 0.2, 0.3]])  # type: ignore[attr-defined]
-    assert np.allclose(np.abs(placed.rotations), 0.5)  # type: ignore[attr-defined]
-    assert np.allclose(static["image_info"].K[0, 0], 50.0)  # type: ignore[attr-defined]
+    assert np.allclose(placed.translations, [[0.1, 0.2, 0.3]])
+    assert np.allclose(np.abs(placed.rotations), 0.5)
+    assert np.allclose(static["image_info"].K[0, 0], 50.0)
     assert not done.left_out
 
 

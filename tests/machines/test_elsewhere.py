@@ -53,7 +53,7 @@ def test_run_is_over_when_machine_ends_it_or_has_another(endpoint: str, ends: st
 
         deadline = time.monotonic() + 10
         if ends == "its own end":
-            while not attach._elsewhere.get()._over and time.monotonic() < deadline:  # type: ignore[union-attr]
+            while not attach._elsewhere.get()._over and time.monotonic() < deadline:
                 assert still_runs(found)
                 bus.session.put(OVER_KEY, msgpack.packb(1.0))
         while still_runs(found):

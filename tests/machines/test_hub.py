@@ -46,7 +46,7 @@ def test_agents_get_pending_messages_before_the_link_closes(tmp_path: Path) -> N
     routes = Routes([], {}, {}, frozenset(), frozenset()).to_json()
     config = HubConfig("@link", endpoint, None, listen, (), "run", ("robot",), "test", routes, {}, True)
     inbox, taken = Inbox(), list[bytes]()
-    hub = Hub(config, SimpleNamespace(send=lambda kind, **fields: None), inbox, ())  # type: ignore[arg-type]
+    hub = Hub(config, SimpleNamespace(send=lambda kind, **fields: None), inbox, ())
     hub.open()
     with closing(router((), (endpoint,), {})) as bus:
         up, down = (machine_key("robot", "run", way) for way in ("up", "down"))

@@ -187,7 +187,7 @@ ADDRESSED = r"expected tls/<address>:<port>"
 )
 def test_endpoint_without_keys_or_port_is_refused(keys: Path, held: str | None, endpoint: str, reason: str) -> None:
     with pytest.raises(NetworkError, match=reason):
-        settings(held and keys / held, endpoint)  # type: ignore[arg-type]
+        settings(held and keys / held, endpoint)
     assert settings(None, "unixsock-stream//run/meet") == {}
 
 
@@ -279,7 +279,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
         command += ["--connect", endpoint, "--keys", str(keys / held)]
         env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(HERE)}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen(command, text=True, env=env, cwd=tmp_path, **pipes)  # type: ignore[call-overload]
+        return subprocess.Popen(command, text=True, env=env, cwd=tmp_path, **pipes)
 
     def follow(supervisor: Supervisor) -> None:
         try:

@@ -62,7 +62,7 @@ def met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Orders, list[e
     endpoints = dict.fromkeys([*processes, LINK], "none")
     pairs = pairs_of(plan.graph, processes)
     remote = Remote(
-        plan, plan.machines, processes, pairs, endpoints, orders, fed.append, lambda *_: None, lambda _: None  # type: ignore[arg-type]
+        plan, plan.machines, processes, pairs, endpoints, orders, fed.append, lambda *_: None, lambda _: None
     )  # fmt: skip
     for machine in ("robot", "arm"):
         remote.take(events.Said(LINK, "link", {"machine": machine, "up": True}))

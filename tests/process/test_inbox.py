@@ -100,7 +100,7 @@ def test_a_failed_process_waits_for_the_supervisor_whatever_else_wakes_it() -> N
                 raise queue.Empty
             return item
 
-    assert await_leave(Woken())  # type: ignore[arg-type]
+    assert await_leave(Woken())
 
 
 def test_the_turn_is_another_threads_only_while_the_one_that_has_it_waits_for_nothing(wired: Wired) -> None:

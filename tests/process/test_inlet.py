@@ -23,10 +23,10 @@ class Inflow:
         self.channel = RecordedChannel()
         self.now = 0.0
         self.inlet = Inlet(
-            self.channel,  # type: ignore[arg-type]
+            self.channel,
             lambda stream, envelope: self.delivered.append((envelope.kind, envelope.seq)),
             static=static,
-            losses=losses_of("taker", self.channel, live=live),  # type: ignore[arg-type]
+            losses=losses_of("taker", self.channel, live=live),
             from_start=from_start,
             complaints=ThrottledWarnings(lambda: self.now, lambda line: self.printed.append(line) is None),
         )

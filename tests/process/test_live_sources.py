@@ -63,7 +63,7 @@ class Sources:
         window, backlog = Window(256, 1 << 20), Window(4096, 1 << 24)
         self.live = LiveSources(
             self.inbox,
-            self.channel,  # type: ignore[arg-type]
+            self.channel,
             Pace(None),
             window,
             backlog,

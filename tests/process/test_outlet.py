@@ -30,7 +30,7 @@ class Linked:
         self.descriptors = make_ring(4096), os.eventfd(0, os.EFD_NONBLOCK), make_board()
         link = Outgoing(*self.descriptors, most)
         self.outlet = Outlet(
-            RecordedChannel(),  # type: ignore[arg-type]
+            RecordedChannel(),
             {},
             fanout=Fanout([([INFO, FAST], link)]),
             namespace="test",
@@ -120,7 +120,7 @@ def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: 
 
 def test_restarted_process_sends_only_message_and_end_on_a_static_stream(linked: Linked) -> None:
     linked.outlet = Outlet(
-        RecordedChannel(),  # type: ignore[arg-type]
+        RecordedChannel(),
         {},
         fanout=Fanout([([INFO, FAST], Outgoing(*linked.descriptors, None))]),
         namespace="test",

@@ -55,6 +55,6 @@ def test_sinks_of_live_runs_let_others_begin(monkeypatch: pytest.MonkeyPatch, li
     config = SinkConfig("@recorder", "record", load_graph(GRAPH).to_json(), [], [], {}, live=live)
     channel: Any = SimpleNamespace(send=lambda *_, **__: None)
 
-    main._make("sink", asdict(config), channel, SimpleNamespace(), None).open()  # type: ignore[arg-type]
+    main._make("sink", asdict(config), channel, SimpleNamespace(), None).open()
 
     assert asked == [True] * live

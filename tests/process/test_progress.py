@@ -26,7 +26,7 @@ class Reporting:
         )  # fmt: skip
         self.channel, self.now = RecordedChannel(), 0.0
         driver = Driver()
-        driver.operators.append(self.operator)  # type: ignore[arg-type]
+        driver.operators.append(self.operator)
         live: Any = SimpleNamespace(runners=[], behind=dict)
         channel: Any = self.channel
         self.progress = Progress(channel, driver, live, lambda: self.now)

@@ -257,7 +257,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
 
 def test_unknown_compression_is_refused_before_a_file_is_made(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="known: zstd, lz4, none"):
-        RecordingWriter(tmp_path / "a.mcap", metadata={}, compression="gzip")  # type: ignore[arg-type]
+        RecordingWriter(tmp_path / "a.mcap", metadata={}, compression="gzip")
     assert not (tmp_path / "a.mcap").exists()
 
 

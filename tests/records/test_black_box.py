@@ -21,7 +21,7 @@ PORTS = {"camera": ("image", "info"), "detector": ("boxes",)}
 def record(index: int, operator: str = "camera", *, size: int = 0, kind: str = "fire") -> FiringRecord:
     outputs = (Emission(index, 100 + index, bytes(16)), *(None for _ in PORTS[operator][1:]))
     detail = {"name": "gain", "value": index} if kind == "param" else {"state": bytes(size)}
-    return FiringRecord(operator, 0, index, kind, 100 + index, outputs=outputs, detail=detail)  # type: ignore[arg-type]
+    return FiringRecord(operator, 0, index, kind, 100 + index, outputs=outputs, detail=detail)
 
 
 @pytest.fixture

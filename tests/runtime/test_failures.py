@@ -34,7 +34,7 @@ def broken(how: str) -> Graph:
 
 def fails(graph: Graph, **options: object) -> RunFailed:
     with pytest.raises(RunFailed) as caught:
-        Supervisor(RunPlan(graph, **options)).run()  # type: ignore[arg-type]
+        Supervisor(RunPlan(graph, **options)).run()
     return caught.value
 
 

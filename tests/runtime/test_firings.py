@@ -196,7 +196,7 @@ def test_a_live_run_with_forced_frontiers_is_driven_again_by_its_written_records
 def _entries(firing: Firing) -> list[Entry]:
     found: list[Entry] = []
     for given_ in firing.inputs.values():
-        found += [given_] if isinstance(given_, Entry) else list(given_ or ())  # type: ignore[arg-type]
+        found += [given_] if isinstance(given_, Entry) else list(given_ or ())
     return found
 
 

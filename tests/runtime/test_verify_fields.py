@@ -54,7 +54,7 @@ def test_the_first_difference_of_a_culprit_names_field_element_and_values(record
     assert (field.field, field.index, field.count, field.size) == ("vectors", (0, 2), 1, 3)
     with Recording(recorded) as recording:
         stored = next(m for m in recording.messages(["test/smooth/mean"]) if m.seq == output.seq).message
-    assert field.a == float(stored.vectors[0, 2])  # type: ignore[attr-defined]
+    assert field.a == float(stored.vectors[0, 2])
     assert isinstance(field.a, float)
     assert isinstance(field.b, float)
     assert field.max_difference == pytest.approx(abs(field.b - field.a))

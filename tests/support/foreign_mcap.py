@@ -35,5 +35,5 @@ def foreign_mcap(
             writer.add_message(channels[topic], time, data, time, numbers[topic])
         for name, values in (metadata or {}).items():
             writer.add_metadata(name, dict(values))
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path

@@ -68,7 +68,7 @@ def assert_one_calibration(
 
 def texts(played: Played) -> list[str]:
     """Returns the first text of every status."""
-    return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
+    return [status.messages[0] for status in played["status"]]
 
 
 def largest_errors(results: Sequence[TrackResult], truth: Sequence[Matrix]) -> tuple[float, float]:

@@ -249,7 +249,7 @@ def test_a_stream_that_breaks_its_promise_is_an_error_that_names_it() -> None:
 )
 def test_a_declaration_that_means_nothing_is_refused(build: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        build()  # type: ignore[operator]
+        build()
 
 
 def test_sampled_streams_keep_only_what_a_future_firing_can_need() -> None:

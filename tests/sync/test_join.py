@@ -90,7 +90,7 @@ def test_an_anchor_is_passed_over_once_the_tolerance_is() -> None:
     aligner = join(tolerance=10)
     push(aligner, "a", 100)
     aligner.advance("x", 109)
-    assert aligner.waiting().stamp == 100  # type: ignore[union-attr]
+    assert aligner.waiting().stamp == 100
     aligner.advance("x", 110)
     assert aligner.waiting() is None
     assert aligner.drops == {("a", "unmatched"): 1}
@@ -102,7 +102,7 @@ def test_a_later_candidate_waits_for_the_next_anchor_to_be_farther() -> None:
     push(aligner, "x", 104)
     aligner.advance("a", 106)
     assert aligner.poll() is None  # an anchor at 107 would be nearer to 104
-    assert aligner.waiting().needs == {"a": 107}  # type: ignore[union-attr]
+    assert aligner.waiting().needs == {"a": 107}
     aligner.advance("a", 107)  # 2 * 104 - 100 - 1
     assert pairs(poll_all(aligner)) == [(100, 104)]
 

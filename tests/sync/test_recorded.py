@@ -28,7 +28,7 @@ def test_a_message_is_held_until_the_last_firing_that_takes_it(firings: int) -> 
         aligner.push("x", Entry(stamp, seq=stamp))
         firing = aligner.take(record)
         assert firing is not None
-        assert firing.inputs["map"].value == "the map"  # type: ignore[union-attr]
+        assert firing.inputs["map"].value == "the map"
 
     assert aligner.buffered() == {"map": 0, "x": 0}
     assert not aligner.takes("map", Entry(0))

@@ -127,7 +127,7 @@ def test_arrays_are_aligned_read_only_views_of_the_buffer() -> None:
         assert offset % ALIGNMENT == 0
         assert not data.flags.writeable
     with pytest.raises(ValueError):
-        message.arrays()[0].flags.writeable = True  # type: ignore[union-attr]
+        message.arrays()[0].flags.writeable = True
 
 
 def test_a_kind_that_is_none_is_refused() -> None:

@@ -77,14 +77,14 @@ def test_status_names_rest_and_where_the_heading_comes_from() -> None:
     made = Turns(14.0)
     made.field[1200:] += [60e-6, 0.0, 0.0]  # beside iron
     played = play(OrientationFilter(), {"imu": made.imu(), "magnetic_field": made.fields()})
-    words = [(m.messages[0], int(m.levels[0])) for m in played["status"]]  # type: ignore[attr-defined]
+    words = [(m.messages[0], int(m.levels[0])) for m in played["status"]]
     disturbed = ("in motion; magnetic field disturbed: heading from the gyroscope meanwhile", 1)
     assert words[0] == disturbed  # until the field has been the same for some seconds
     assert words[-2:] == [("in motion; heading from the magnetic field", 0), disturbed]
     assert any(word.startswith("at rest; ") for word, _ in words)
     asked = play(OrientationFilter(heading="relative"), {"imu": made.imu()})["status"][-1]
-    assert asked.messages == ("in motion; heading from the gyroscope alone, as asked",)  # type: ignore[attr-defined]
-    assert asked.levels.tolist() == [0]  # type: ignore[attr-defined]
+    assert asked.messages == ("in motion; heading from the gyroscope alone, as asked",)
+    assert asked.levels.tolist() == [0]
 
 
 def test_dropped_samples_are_bridged() -> None:

@@ -110,7 +110,7 @@ def test_a_part_of_a_drive_has_the_packets_of_its_frames_from_the_origin_of_the_
     part = play(KittiRaw(path=str(folder), start=1, stop=4, stride=2))
     assert offsets(part, "points") == [100, 300]
     assert offsets(part, "imu") == [120, 220]
-    assert part["odometry"][0].position[1] == pytest.approx(11.12, abs=0.01)  # type: ignore[attr-defined]
+    assert part["odometry"][0].position[1] == pytest.approx(11.12, abs=0.01)
 
 
 def test_a_drive_without_times_has_its_packets_with_their_frames(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_a_recording_becomes_a_drive_whose_packets_read_as_its_messages(tmp_path
                 for field in type(one).FIELDS:
                     a, b = getattr(one, field.name), getattr(other, field.name)
                     assert a == b if isinstance(a, str | int | None) else np.allclose(a, b, atol=1e-9), field.name
-    assert played["imu_extrinsics"][0].translations.round(9).tolist() == [[0.8, -0.3, 0.8]]  # type: ignore[attr-defined]
+    assert played["imu_extrinsics"][0].translations.round(9).tolist() == [[0.8, -0.3, 0.8]]
     assert done.left_out == {}
 
 
