@@ -20,7 +20,7 @@ from dataflow.cli.support.values import take_plainly
 
 MAKE = "Run, replay, verify"
 LOOK = "Look at graphs, operators and recordings"
-MATERIAL = "Work with recordings and bags"
+RECORDINGS = "Work with recordings and bags"
 FOLLOW = "Follow a running graph"
 
 
@@ -151,9 +151,9 @@ BUILT_IN: tuple[Command | Family, ...] = (
     *_listed(LOOK, "inspection:operators inspection:messages demo:graphs recordings:info recordings:diff"),
     *_listed(LOOK, "latency:latency lint:lint"),
     *_listed(LOOK, "viewing:view foxglove:foxglove", elsewhere=True),
-    *_listed(MATERIAL, "convert:convert editing:cut"),
-    Command("editing:filter_", MATERIAL, "filter"),
-    *_listed(MATERIAL, "editing:split merging:merge merging:recover"),
+    *_listed(RECORDINGS, "convert:convert editing:cut"),
+    Command("editing:filter_", RECORDINGS, "filter"),
+    *_listed(RECORDINGS, "editing:split merging:merge merging:recover"),
     Command("following.live:list_running", FOLLOW, "list"),
     *_listed(FOLLOW, "following.live:echo following.live:hz following.top:top", elsewhere=True),
     *_listed(FOLLOW, "following.health:health following.health:metrics following.spans:spans", elsewhere=True),
