@@ -31,7 +31,7 @@ from mcap.records import ChunkIndex
 from dataflow.execution.snapshots import pack_state
 from dataflow.messages import FeatureVector
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.layout import RESERVED_METADATA
+from dataflow.recording.layout import RESERVED_METADATA, firings_topic
 from dataflow.recording.mcap.ending import record_bytes
 from dataflow.recording.mcap.seals import sealed
 from dataflow.recording.streams.codecs import codec_for
@@ -94,7 +94,8 @@ class Maker:
         """Messages `begin` to `end` - 1: the chunks that a run writes, copies of one with other times."""
         file = self.writer._file
         streams = [self.writer._streams[name].channel for name in (SOURCE, SUM)]
-        logs = [self.writer._firings[name][0] for name in ("pulse", "sum")]
+        topics = [firings_topic(self.writer._namespace, name) for name in ("pulse", "sum")]
+        logs = [self.writer._run[topic][0] for topic in topics]
         body = bytes(codec_for(FeatureVector).encode(numbered(EPOCH, 0))[0][0])
         block = Block(logs, [payload for _, payload in self.records(begin, true=False)], streams, [body, body])
         file._chunks._packed.append(zlib.compress(file._chunks._newest))

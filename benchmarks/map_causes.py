@@ -26,7 +26,7 @@ from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene import SemanticMap
-from operators.scene.box_overlap import upright_iou
+from operators.scene.bodies import upright_iou
 from operators.scene.scoring import Box, NodeScore, boxes_of
 from operators.tracking.assignment import overlap
 

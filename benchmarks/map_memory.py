@@ -17,9 +17,8 @@ import psutil
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.scene.map.box_images import image_boxes
-from operators.scene.map.cuboid import ImageView
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
+from operators.scene.map.cuboid import ImageView, image_boxes
 from operators.scene.map.matching import MapSettings, Observation
 from operators.scene.map.object_map import ObjectMap
 from operators.scene.map.range_view import RangeView
@@ -66,7 +65,7 @@ def main() -> int:
     numbers = np.arange(arguments.things)
     things = np.column_stack([np.full(arguments.things, 2.0), APART * numbers, 0.1 + 0.1 * (numbers % 3)])
     end = float(things[-1, 1])
-    known, random = ObjectMap(1, Kinds([], {}), MapSettings()), np.random.default_rng(1)
+    known, random = ObjectMap(1, ClassPriors([], {}), MapSettings()), np.random.default_rng(1)
     sizes: dict[int, float] = {}
     twice, began = round(2 * end / STEP), time.thread_time()
     print("views  objects  given  MB   ms a view (CPU)")

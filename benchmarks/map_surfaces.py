@@ -24,8 +24,8 @@ from dataflow.messages import SceneGraph
 from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.scene import SceneGraphBuilder
-from operators.scene.box_overlap import shared_volume, upright_iou
-from operators.scene.map.cells import Cells
+from operators.scene.bodies import shared_volume, upright_iou
+from operators.scene.map.voxels import VoxelSet
 from operators.scene.scoring import Box, boxes_of, match_nodes
 from operators.simulator.worlds.make import make_world
 
@@ -89,7 +89,7 @@ def walls(world: World) -> list[tuple[Array, Array]]:
 
 def truth(world: World) -> list[Sheet]:
     """The surfaces of a world as far as clouds show them."""
-    seen: dict[tuple[str, int], Cells] = {}
+    seen: dict[tuple[str, int], VoxelSet] = {}
     sheets = walls(world)
     names: dict[int, str] = {}
     for frame in world.frames[::4]:
@@ -107,9 +107,9 @@ def truth(world: World) -> list[Sheet]:
                 shown["tabletop", i] = own[np.abs(own[:, 2] - boxes[i][0][2] - boxes[i][1][2] / 2) < 0.03]
         for key, own in shown.items():
             if len(own):
-                seen.setdefault(key, Cells(SIDE)).add(Cells.of(own, SIDE))
+                seen.setdefault(key, VoxelSet(SIDE)).add(VoxelSet.of(own, SIDE))
     last = boxes_of(world.frames[-1].scene)[0]
-    return [made for (label, k), cells in seen.items() if (made := _true(label, k, cells, sheets, last)) is not None]
+    return [made for (label, k), voxels in seen.items() if (made := _true(label, k, voxels, sheets, last)) is not None]
 
 
 def _labelled(frame: Frame, world: World) -> tuple[Array, NDArray[np.str_], NDArray[np.int64]]:
@@ -122,8 +122,10 @@ def _labelled(frame: Frame, world: World) -> tuple[Array, NDArray[np.str_], NDAr
     return transform_points(T, frame.cloud.points.astype(float)), named, instances
 
 
-def _true(label: str, k: int, cells: Cells, sheets: list[tuple[Array, Array]], boxes: dict[int, Box]) -> Sheet | None:
-    points = cells.points[cells.hits >= VIEWS]
+def _true(
+    label: str, k: int, voxels: VoxelSet, sheets: list[tuple[Array, Array]], boxes: dict[int, Box]
+) -> Sheet | None:
+    points = voxels.points[voxels.hits >= VIEWS]
     if len(points) < 5:
         return None
     if label == "wall":

@@ -18,7 +18,7 @@ import numpy as np
 import onnxruntime
 
 from dataflow.messages import Image
-from operators.language import Tokenizer
+from operators.language.bpe import Tokenizer
 from operators.models.fetch import digest_of, fetch
 from operators.models.registry import Registry
 from operators.segmentation import OnnxSegmenter

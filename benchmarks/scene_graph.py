@@ -23,7 +23,7 @@ from semantic_map import mapped, plainly_seen, scored, seen
 from sensed_worlds import Frame, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, SceneGraph
-from operators.recognition.activity import score as activity_score
+from operators.recognition.activity import samples
 from operators.recognition.activity.tracked_people import simulated_labels
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
@@ -55,7 +55,7 @@ def compare_acts(world: World, frames: list[Frame], made: list[tuple[Activity, d
 def macro_f1(counts: Counter[str]) -> float:
     """Returns the macro-F1 of counts by `true|said`; NaN where there are none."""
     pairs = [key.split("|") for key in counts.elements()]
-    return activity_score.macro_f1([t for t, _ in pairs], [s for _, s in pairs]) if pairs else float("nan")
+    return samples.macro_f1([t for t, _ in pairs], [s for _, s in pairs]) if pairs else float("nan")
 
 
 def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]]:

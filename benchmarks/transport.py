@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.messages import Image
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig, decode, encode, reserve_endpoints
+from dataflow.transport import Bus, Envelope, Kind, NetworkConfig, Reservation, decode, encode
 
 STREAM, ECHO = "bench/source/image", "bench/@/echo"
 SIZES = {"1 KB": (16, 21), "100 KB": (160, 208), "900 KB": (480, 640), "4 MB": (1080, 1296)}
@@ -162,7 +162,7 @@ def stall(producer: Producer, consumer: int, seconds: float) -> tuple[int, int]:
 
 def run(mode: str, rounds: int, stalled: float) -> list[str]:
     rows = []
-    with reserve_endpoints(1) as reserved, Bus(NetworkConfig(listen=reserved.endpoints, **MODES[mode])) as bus:
+    with Reservation(1) as reserved, Bus(NetworkConfig(listen=reserved.endpoints, **MODES[mode])) as bus:
         child = subprocess.Popen([sys.executable, __file__, "--consume", mode, "--endpoint", reserved.endpoints[0]])
         try:
             producer = Producer(bus)

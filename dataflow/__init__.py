@@ -16,8 +16,9 @@ Importing this package imports nothing else: each name below is loaded when it i
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
     from dataflow.api.builder import Graph
@@ -27,24 +28,19 @@ if TYPE_CHECKING:
     from dataflow.api.session import Session
     from dataflow.api.stream import RecordedStream
     from dataflow.testing import Played, play
-
-_HOMES = {
-    "Graph": "dataflow.api.builder",
-    "Joined": "dataflow.api.join",
-    "Played": "dataflow.testing",
-    "RecordedStream": "dataflow.api.stream",
-    "RecordedStreams": "dataflow.api.recordings",
-    "RunResult": "dataflow.api.runs",
-    "Session": "dataflow.api.session",
-    "Verified": "dataflow.api.runs",
-    "launch": "dataflow.api.runs",
-    "open": "dataflow.api.recordings",
-    "play": "dataflow.testing",
-    "replay": "dataflow.api.runs",
-    "run": "dataflow.api.runs",
-    "verify": "dataflow.api.runs",
-}
-"""The module of each public name."""
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "api.builder": ("Graph",),
+            "api.join": ("Joined",),
+            "api.recordings": ("RecordedStreams", "open"),
+            "api.runs": ("RunResult", "Verified", "launch", "replay", "run", "verify"),
+            "api.session": ("Session",),
+            "api.stream": ("RecordedStream",),
+            "testing": ("Played", "play"),
+        },
+    )
 
 __all__ = [
     "Graph",
@@ -62,15 +58,3 @@ __all__ = [
     "run",
     "verify",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    home = _HOMES.get(name)
-    if home is None:
-        raise AttributeError(f"module 'dataflow' has no attribute {name!r}; it has {', '.join(__all__)}")
-    found = globals()[name] = getattr(importlib.import_module(home), name)
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -18,12 +18,7 @@ _OF_MODULES = {
 """Module → distribution, where the names differ."""
 INSTALL = "it comes with: pip install"
 _COLLECTIONS = ("all", "dev")
-_BY_CALLER = {
-    "operators.": "perception",
-    "dataflow.view": "view",
-    "dataflow.sweep.plan": "remote",
-    "dataflow.": "bags",
-}
+_BY_CALLER = {"operators.": "perception", "dataflow.view": "view", "dataflow.sweep.plan": "remote", "dataflow.": "bags"}
 """Package of the importing module → the extra that serves it, where several extras bring what is missing."""
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*;\s*(?:(.*)\s+and\s+)?extra\s*==\s*['\"](\w+)['\"]")

@@ -43,10 +43,7 @@ _SCALARS: dict[Any, tuple[type, ...]] = {
     bytes: (bytes,),
     types.NoneType: (types.NoneType,),
 }
-_SEQUENCES: dict[Any, Callable[[Iterable[Any]], Any]] = {
-    list: list,
-    collections.abc.Sequence: list,
-}
+_SEQUENCES = (list, collections.abc.Sequence)
 _MAPPINGS = (dict, collections.abc.Mapping, collections.OrderedDict, Counter, defaultdict)
 
 
@@ -321,7 +318,7 @@ class _Typing:
             kind = arguments[0] if arguments else Any
             return origin(self._hashed(kind, item, place) for item in _listed(value, place))
         if origin in _SEQUENCES:
-            return _SEQUENCES[origin](self._items(arguments[:1], value, place, current))
+            return self._items(arguments[:1], value, place, current)
         if origin is tuple:
             return self._tuple(arguments, value, place, current)
         if origin is deque:

@@ -86,8 +86,9 @@ def _row(field: Field) -> str:
 
 
 def _helpers(cls: type[Message]) -> Iterator[str]:
-    """A line for each public property and method that the class itself defines."""
-    for name, member in vars(cls).items():
+    """A line for each public property and method that the class itself defines, or a base of it that is no message."""
+    owners = (*(base for base in cls.__bases__ if not issubclass(base, Message)), cls)
+    for name, member in (item for owner in owners for item in vars(owner).items()):
         if name.startswith("_") or name == "validate":
             continue
         if isinstance(member, property):

@@ -3,7 +3,7 @@
     python benchmarks/peers/cold.py                      # this checkout
     python benchmarks/peers/cold.py --against OTHER      # another checkout in turns with this one, in one run
 
-Both processes of the round trip are here as what they are, with their rings, aligners, black boxes and firing records,
+Both processes of the round trip are here as what they are, with their links, aligners, black boxes and firing records,
 but without a network; each waits where it would wait for its eventfd, and is woken in turn. Before each turn all sleep,
 and a buffer larger than the CPU's caches is read, so that a turn finds what a process finds that has waited for 10 ms.
 No wake-up of a process is in these figures. They are medians over turns, and the turns of two checkouts alternate; so a
@@ -100,18 +100,18 @@ class Pair:
         from dataflow.process.streams.outlet import Network
         from dataflow.records.black_box import make_black_box
         from dataflow.supervision.configs import configurations
+        from dataflow.supervision.links import Links, pairs_of
         from dataflow.supervision.plan import RunPlan, process_plans
-        from dataflow.supervision.rings import Rings, pairs_of
 
         settings = [f"nbytes={size}", "count=1000000"]
         graph = load_graph(str(HERE / "roundtrip.yaml"), settings=settings, live=True)
         plan = RunPlan(graph, live=True)
         plans = process_plans(plan)
         configs = configurations(plan, plans, dict.fromkeys(plans, ""))
-        self.rings = Rings(list(plans), pairs_of(graph, plans))
+        self.links = Links(list(plans), pairs_of(graph, plans))
         made = []
         for label, (_, config) in configs.items():
-            handed = take_descriptors([*self.rings.handed(label), make_black_box()], config)
+            handed = take_descriptors([*self.links.handed(label), make_black_box()], config)
             inbox = Inbox(handed.wake, handed.incoming)
             channel: Any = SimpleNamespace(send=lambda kind, **fields: None)
             one = OperatorProcess(ProcessConfig(**config), channel, inbox, handed.outgoing, box=handed.box)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from dataflow.api.graphs import GraphBuilder
+from dataflow.api.graphs import GraphBuilder, words
 from dataflow.arguments import checked, require
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph as ResolvedGraph
@@ -120,8 +120,7 @@ class Graph(GraphBuilder):
     def build(self, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
         """The graph, checked wholly. `settings` change parameters of operators inside nested graphs, as `--set` does.
         Raises `GraphError` with everything that is wrong."""
-        words = [f"{name}={v if isinstance(v, str) else _json(v)}" for name, v in (settings or {}).items()]
-        return load_text(self.yaml(), file=FILE, folder=self._folder, settings=words)
+        return load_text(self.yaml(), file=FILE, folder=self._folder, settings=words(settings))
 
     def run(self, record: str | Path | None = None, **options: Any) -> RunResult:
         """Runs the graph in this process; see `dataflow.run`."""

@@ -26,9 +26,15 @@ GraphLike = GraphBuilder | ResolvedGraph | str | Path
 def resolved(graph: GraphLike, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
     """The checked graph of a builder or a YAML file. Raises `GraphError`; `ValueError` for settings without a file."""
     if isinstance(graph, str | Path):
-        given = {name: v if isinstance(v, str) else json.dumps(v) for name, v in (settings or {}).items()}
-        words = [f"{name}={value}" for name, value in given.items()]
-        return load_graph(graph, settings=words)
+        return load_graph(graph, settings=words(settings))
     if settings:
         raise ValueError("settings change a graph file; give parameters to Graph.add()")
     return graph.build() if isinstance(graph, GraphBuilder) else graph
+
+
+def words(settings: Mapping[str, Any] | None) -> list[str]:
+    """Settings as the command line has them."""
+    return [
+        f"{name}={v if isinstance(v, str) else json.dumps(v, ensure_ascii=False)}"
+        for name, v in (settings or {}).items()
+    ]

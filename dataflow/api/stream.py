@@ -57,7 +57,7 @@ class RecordedStream(Sequence[Message]):
         return tuple(field.name for field in self.message_type.FIELDS)
 
     @cached_property
-    def _index(self) -> StreamIndex[Recorded]:
+    def _index(self) -> StreamIndex:
         index = self._recording.index(self.name)
         if (unread := self._recording.unread.get(self.name)) is not None:
             warnings.warn(f"{self._recording.path}: {self.name}: {unread}", stacklevel=3)

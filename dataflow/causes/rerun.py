@@ -19,8 +19,8 @@ from dataflow.causes.interventions import Interventions
 from dataflow.causes.places import Places
 from dataflow.causes.sources import CHANCE, COMPILED, HASHES, HEAP, INPUT, LOCALE, MODULE, THREADS, kind_of, name_of
 from dataflow.causes.traps import Site, Traps
+from dataflow.execution.comparator import Comparator
 from dataflow.execution.failure import OperatorFailure, readable
-from dataflow.execution.judge import Judge
 from dataflow.execution.memory import MemoryGuard
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
@@ -168,7 +168,7 @@ def _repeat(
         )
         interventions.number_objects()
         runner = work.runners[name]
-        runner.judge = follower = Follower(runner.judge)
+        runner.comparator = follower = Follower(runner.comparator)
         if lines is not None:
             lines.set(runner.operator)
         try:
@@ -180,11 +180,11 @@ def _repeat(
     return follower, time.monotonic() > deadline
 
 
-class Follower(Judge):
+class Follower(Comparator):
     """Keeps what an operator makes in each call, whether or not it is what was recorded."""
 
-    def __init__(self, judge: Judge) -> None:
-        self.__dict__.update(vars(judge))
+    def __init__(self, comparator: Comparator) -> None:
+        self.__dict__.update(vars(comparator))
         self.made: list[str] = []
 
     def outputs(self, record: FiringRecord, messages: Mapping[str, Message]) -> Iterator[tuple[str, Message, int]]:

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.commands import completion
-from dataflow.cli.support.arguments import FLAG
+from dataflow.cli.support.options import option
 from dataflow.cli.support.output import (
     COULD_NOT_RUN,
     TRACEBACK,
@@ -47,17 +47,12 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def dataflow(
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version", metavar=FLAG, is_eager=True, callback=_print_version, help="Print the version and exit."
-        ),
+        bool, option("--version", "Print the version and exit.", is_eager=True, callback=_print_version)
     ] = False,
     show_traceback: Annotated[
         bool,
-        typer.Option(
-            "--traceback",
-            metavar=FLAG,
-            help="Show where an error comes from; also behind the command. Environment: DATAFLOW_TRACEBACK=1.",
+        option(
+            "--traceback", "Show where an error comes from; also behind the command. Environment: DATAFLOW_TRACEBACK=1."
         ),
     ] = False,
 ) -> None:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, MutableMapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import friendly_errors
 from dataflow.cli.support.values import take_plainly
 
 MAKE = "Run, replay, verify"
 LOOK = "Look at graphs, operators and recordings"
-MATERIAL = "Work with recordings and bags"
+RECORDINGS = "Work with recordings and bags"
 FOLLOW = "Follow a running graph"
 
 
@@ -49,41 +52,65 @@ class Command:
     def add_to(self, app: typer.Typer) -> None:
         """Registers the function with an application."""
         module, _, function = self.home.partition(":")
-        called: Callable[..., None] = getattr(import_module(f"dataflow.cli.commands.{module}"), function)
-        if self.elsewhere:
-            called = _elsewhere(called)
+        called = _with_options(getattr(import_module(f"dataflow.cli.commands.{module}"), function), self.elsewhere)
         settings = {"ignore_unknown_options": True} if self.ignore_unknown_options else {}
         app.command(
             self.called, rich_help_panel=self.panel, help=paragraphs(called.__doc__ or ""), context_settings=settings
         )(called)
 
 
-def _elsewhere(called: Callable[..., None]) -> Callable[..., None]:
-    """Returns a command with the options that name a graph of another machine."""
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The options that name a graph of another machine."""
 
-    @functools.wraps(called)
-    def at(*words: Any, connect: str | None = None, keys: Path | None = None, **options: Any) -> None:
-        if connect is None:
-            called(*words, **options)
-            return
-        from dataflow.client.attach import elsewhere
-
-        with elsewhere(connect, keys):
-            called(*words, **options)
-
-    where = typer.Option("--connect", metavar="ENDPOINT", help="Follow a graph of another machine: its --listen.")
-    held = typer.Option("--keys", metavar="FOLDER", help="Keys of tools or of a machine, for --connect.")
-    added = {"connect": Annotated[str | None, where], "keys": Annotated[Path | None, held]}
-    signature = inspect.signature(called, eval_str=True)
-    known = list(signature.parameters.values())
-    more = [inspect.Parameter(name, _KEYWORD, default=None, annotation=kind) for name, kind in added.items()]
-    at.__signature__ = signature.replace(parameters=[*known, *more])  # type: ignore[attr-defined]
-    at.__annotations__ = {each.name: each.annotation for each in (*known, *more)}
-    del at.__wrapped__
-    return at
+    connect: Annotated[str | None, option("--connect ENDPOINT", "Follow a graph of another machine: its --listen.")] = (
+        None
+    )
+    keys: Annotated[Path | None, option("--keys FOLDER", "Keys of tools or of a machine, for --connect.")] = None
 
 
-_KEYWORD = inspect.Parameter.KEYWORD_ONLY
+def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[..., None]:
+    """Returns a command as Typer takes it: what groups options (a dataclass) is replaced by its fields."""
+    taken = [*_single(called), *(_single(Elsewhere) if elsewhere else ())]
+
+    def command(**given: Any) -> None:
+        where = _filled(Elsewhere, given) if elsewhere else Elsewhere()
+        with friendly_errors(), _attached(where):
+            _filled(called, given)
+
+    functools.update_wrapper(command, called)
+    del command.__wrapped__  # type: ignore[attr-defined]
+    command.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in taken}
+    return command
+
+
+def _attached(where: Elsewhere) -> AbstractContextManager[None]:
+    if where.connect is None:
+        return nullcontext()
+    from dataflow.client.attach import elsewhere
+
+    return elsewhere(where.connect, where.keys)
+
+
+def _single(made: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """The parameters of a function or a group, with those of the groups among them in their places."""
+    for each in inspect.signature(made, eval_str=True).parameters.values():
+        if _is_group(each.annotation):
+            yield from _single(each.annotation)
+        else:
+            yield each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+def _filled(made: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """Calls a function, or makes a group, from the values of single options."""
+    parameters = inspect.signature(made, eval_str=True).parameters
+    kinds = {name: each.annotation for name, each in parameters.items()}
+    return made(**{name: _filled(kind, given) if _is_group(kind) else given[name] for name, kind in kinds.items()})
+
+
+def _is_group(annotation: Any) -> bool:
+    return is_dataclass(annotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,53 +139,27 @@ class Family:
         return group
 
 
+def _listed(panel: str, homes: str, *, elsewhere: bool = False) -> Iterator[Command]:
+    """Commands under one heading, by their modules and functions."""
+    return (Command(home, panel, elsewhere=elsewhere) for home in homes.split())
+
+
 BUILT_IN: tuple[Command | Family, ...] = (
-    Command("demo:demo", MAKE),
-    Command("run:run", MAKE),
-    Command("env:env", MAKE),
-    Command("machines:join", MAKE),
-    Command("replay:replay", MAKE),
-    Command("verification:verify", MAKE),
-    Command("debug:debug", MAKE),
-    Command("debug:capture", MAKE),
-    Command("blame:blame", MAKE),
-    Command("blame:drops", MAKE),
-    Command("mcp:mcp", MAKE),
-    Command("sweep:sweep", MAKE),
-    Command("compare:compare", MAKE),
-    Command("inspection:check", LOOK),
-    Command("inspection:show", LOOK),
-    Command("doctor:doctor", LOOK),
-    Command("doctor:devices", LOOK),
-    Command("completion:completion", LOOK),
-    Command("inspection:operators", LOOK),
-    Command("inspection:messages", LOOK),
-    Command("demo:graphs", LOOK),
-    Command("recordings:info", LOOK),
-    Command("recordings:diff", LOOK),
-    Command("convert:convert", MATERIAL),
-    Command("editing:cut", MATERIAL),
-    Command("editing:filter_", MATERIAL, "filter"),
-    Command("editing:split", MATERIAL),
-    Command("merging:merge", MATERIAL),
-    Command("merging:recover", MATERIAL),
-    Command("latency:latency", LOOK),
-    Command("lint:lint", LOOK),
-    Command("viewing:view", LOOK, elsewhere=True),
-    Command("foxglove:foxglove", LOOK, elsewhere=True),
+    *_listed(MAKE, "demo:demo run:run env:env machines:join replay:replay verification:verify debug:debug"),
+    *_listed(MAKE, "debug:capture blame:blame blame:drops mcp:mcp sweep:sweep compare:compare"),
+    *_listed(LOOK, "inspection:check inspection:show doctor:doctor doctor:devices completion:completion"),
+    *_listed(LOOK, "inspection:operators inspection:messages demo:graphs recordings:info recordings:diff"),
+    *_listed(LOOK, "latency:latency lint:lint"),
+    *_listed(LOOK, "viewing:view foxglove:foxglove", elsewhere=True),
+    *_listed(RECORDINGS, "convert:convert editing:cut"),
+    Command("editing:filter_", RECORDINGS, "filter"),
+    *_listed(RECORDINGS, "editing:split merging:merge merging:recover"),
     Command("following.live:list_running", FOLLOW, "list"),
-    Command("following.live:echo", FOLLOW, elsewhere=True),
-    Command("following.live:hz", FOLLOW, elsewhere=True),
-    Command("following.top:top", FOLLOW, elsewhere=True),
-    Command("following.health:health", FOLLOW, elsewhere=True),
-    Command("following.health:metrics", FOLLOW, elsewhere=True),
-    Command("following.spans:spans", FOLLOW, elsewhere=True),
+    *_listed(FOLLOW, "following.live:echo following.live:hz following.top:top", elsewhere=True),
+    *_listed(FOLLOW, "following.health:health following.health:metrics following.spans:spans", elsewhere=True),
     Command("following.logs:logs", FOLLOW),
-    Command("following.pub:pub", FOLLOW, elsewhere=True),
-    Command("following.reload:reload", FOLLOW, elsewhere=True),
-    Command("following.recording:record", FOLLOW, elsewhere=True),
-    Command("playback:playback", FOLLOW, elsewhere=True),
-    Command("following.recording:trigger", FOLLOW, elsewhere=True),
+    *_listed(FOLLOW, "following.pub:pub following.reload:reload following.recording:record", elsewhere=True),
+    *_listed(FOLLOW, "playback:playback following.recording:trigger", elsewhere=True),
     Family(
         "new",
         MAKE,
@@ -170,13 +171,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
           dataflow new operator NearestObstacle
           dataflow new graph obstacle_watch
         """,
-        (
-            Command("new:operator"),
-            Command("new:graph"),
-            Command("new:project"),
-            Command("new:service"),
-            Command("new:agent"),
-        ),
+        tuple(Command(f"new:{name}") for name in ("operator", "graph", "project", "service", "agent")),
     ),
     Family(
         "keys",

@@ -148,10 +148,8 @@ def graph_of(found: RunningGraph) -> Graph:
 
 
 def types_of(graph: Graph) -> TypeOf:
-    """The classes that a tool reads a graph's messages as; the graph's own types by their declarations.
-
-    Nothing of the graph's code is imported: its modules may not even be there where the tool runs.
-    """
+    """The classes that a tool reads a graph's messages as; the graph's own types by their declarations. Nothing of the
+    graph's code is imported: its modules may not even be there where the tool runs."""
     own = {schema: known_type(declaration) for schema, declaration in graph.types.items()}
     return lambda schema: own.get(schema) or message_type(schema)
 

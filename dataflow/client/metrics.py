@@ -106,10 +106,8 @@ def collect(graphs: Iterable[RunningGraph], folders: Iterable[Path]) -> str:
 
 
 class MetricsServer:
-    """Answers `GET /metrics` on a port of loopback with what `collect` returns at that moment; 0: a free port.
-
-    Raises `OSError` where the port is taken.
-    """
+    """Answers `GET /metrics` on a port of loopback with what `collect` returns at that moment; 0: a free port. Raises
+    `OSError` where the port is taken."""
 
     def __init__(self, collect: Callable[[], str], port: int) -> None:
         lock = threading.Lock()

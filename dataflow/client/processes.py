@@ -141,17 +141,13 @@ class Processes:
 
     def reload(self, operator: str, timeout: float) -> dict[str, Any]:
         """Has an operator go on with its code as it is in its files now; what its process answers (`Runner.reload`).
-
-        Raises `Refused`, `NoAnswer`.
-        """
+        Raises `Refused`, `NoAnswer`."""
         key = local_key(self._namespace, "reload", operator)
         return dict(self._answered(key, operator, {"reload": True}, timeout, "it is reloaded"))
 
     def files(self, operator: str, timeout: float) -> dict[str, str]:
-        """The digests of the modules that an operator's code is made of, as their files are now on its machine.
-
-        Raises `Refused`, `NoAnswer`.
-        """
+        """The digests of the modules that an operator's code is made of, as their files are now on its machine. Raises
+        `Refused`, `NoAnswer`."""
         key = local_key(self._namespace, "reload", operator)
         return dict(self._answered(key, operator, {"reload": True, "files": True}, timeout, "nothing is reloaded"))
 

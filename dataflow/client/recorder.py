@@ -257,11 +257,7 @@ def subscribed(found: RunningGraph, streams: Sequence[str]) -> Iterator[Subscrip
 
 
 def record(
-    subscription: Subscription,
-    recorder: AttachedRecorder,
-    *,
-    goes_on: Iterator[bool],
-    idle: float = 0.1,
+    subscription: Subscription, recorder: AttachedRecorder, *, goes_on: Iterator[bool], idle: float = 0.1
 ) -> None:
     """Writes what comes until `goes_on` returns False; then what still waits. Raises `RecordingError`."""
     due = time.monotonic() + FLUSH_EVERY

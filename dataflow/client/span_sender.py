@@ -30,11 +30,8 @@ class Refused(Exception):
 
 
 class SpanSender:
-    """Sends on a separate thread; who gives spans never waits for the collector.
-
-    `write`: sends one request, and returns how many of its spans were refused; it raises `OSError` where it may be
-    repeated, `Refused` where not.
-    """
+    """Sends on a separate thread; who gives spans never waits for the collector. `write`: sends one request, and
+    returns how many of its spans were refused; it raises `OSError` where it may be repeated, `Refused` where not."""
 
     def __init__(self, write: Callable[[str], int], at_most: int = AT_MOST, again_after: float = AGAIN_AFTER) -> None:
         self._write, self._at_most, self._again_after = write, at_most, again_after
@@ -42,32 +39,20 @@ class SpanSender:
         self._changed = threading.Condition()
         self._closing = False
         self._until = float("inf")
-        self._sent = self._lost = self._queued = 0
-        self._reason = ""
+        self._queued = 0
+        self.sent = self.lost = 0
+        """Spans that were taken, and those that were not."""
+        self.reason = ""
+        """Why sending failed the last time, or nothing."""
         self._thread = threading.Thread(target=self._run, name="spans", daemon=True)
         self._thread.start()
-
-    @property
-    def sent(self) -> int:
-        """Spans that were taken."""
-        return self._sent
-
-    @property
-    def lost(self) -> int:
-        """Spans that were not."""
-        return self._lost
-
-    @property
-    def reason(self) -> str:
-        """Why sending failed the last time, or nothing."""
-        return self._reason
 
     def put(self, text: str, spans: int) -> None:
         """Takes a request with so many spans; too many that wait are lost."""
         with self._changed:
             if self._queued + spans > self._at_most:
-                self._lost += spans
-                self._reason = self._reason or "they come faster than they are taken"
+                self.lost += spans
+                self.reason = self.reason or "they come faster than they are taken"
                 return
             self._waiting.append((text, spans))
             self._queued += spans
@@ -80,7 +65,7 @@ class SpanSender:
             self._changed.notify()
         self._thread.join(within + 2 * ANSWER_WITHIN)
         with self._changed:
-            self._lost, self._queued = self._lost + self._queued, 0
+            self.lost, self._queued = self.lost + self._queued, 0
 
     def _run(self) -> None:
         while (request := self._next()) is not None:
@@ -98,17 +83,17 @@ class SpanSender:
             try:
                 refused = self._write(text)
             except Refused as error:
-                self._reason = str(error)
+                self.reason = str(error)
             except (OSError, HTTPException) as error:
-                self._reason = _reason_of(error)
+                self.reason = _reason_of(error)
                 if self._waits(pause):
                     pause = min(2 * pause, AGAIN_AT_LAST)
                     continue
             break
         with self._changed:
             self._queued -= spans
-            self._sent += spans - refused
-            self._lost += refused
+            self.sent += spans - refused
+            self.lost += refused
 
     def _waits(self, pause: float) -> bool:
         """Waits before another try; returns False where there is no time for one."""
@@ -134,10 +119,8 @@ def into_file(path: Path) -> Callable[[str], int]:
 
 
 def to_collector(url: str) -> Callable[[str], int]:
-    """Returns what posts requests to a collector; a URL without a path gets that of the specification.
-
-    Raises ValueError for what is no URL of HTTP.
-    """
+    """Returns what posts requests to a collector; a URL without a path gets that of the specification. Raises
+    ValueError for what is no URL of HTTP."""
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise ValueError(f"{url} is no URL of a collector, such as http://127.0.0.1:4318/v1/traces")

@@ -52,14 +52,7 @@ def _cameras(root: Path) -> Iterator[Device]:
             note = note or "further node of its device: may carry no images"
         elif "RealSense" in name:
             note = note or "with its depth: use: operators.sources:RealSense"
-        yield Device(
-            "camera",
-            str(file),
-            name,
-            "operators.sources:Webcam",
-            {"input": str(file)},
-            note,
-        )
+        yield Device("camera", str(file), name, "operators.sources:Webcam", {"input": str(file)}, note)
 
 
 def _serial_devices(root: Path) -> Iterator[Device]:
@@ -68,14 +61,10 @@ def _serial_devices(root: Path) -> Iterator[Device]:
     files = {file.resolve() for pattern in ("ttyUSB*", "ttyACM*") for file in (root / "dev").glob(pattern)}
     for file in sorted(files | named.keys()):
         path = named.get(file, file)
-        yield Device(
-            "serial",
-            str(path),
-            _text((root / "sys/class/tty" / file.name / "device").resolve().parent / "product"),
-            "operators.sources:NmeaGnss",
-            {"input": str(path), "baud": 9600},
-            _refused(file, "dialout") or SERIAL,
-        )
+        name = _text((root / "sys/class/tty" / file.name / "device").resolve().parent / "product")
+        params: dict[str, str | int] = {"input": str(path), "baud": 9600}
+        note = _refused(file, "dialout") or SERIAL
+        yield Device("serial", str(path), name, "operators.sources:NmeaGnss", params, note)
 
 
 def _refused(file: Path, group: str) -> str:

@@ -42,23 +42,20 @@ def check_system() -> Iterator[Finding]:
         return
     yield Finding(group, "platform", State.OK, text)
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    state = State.WARNING if load > 2 * cores else State.OK
-    hint = "live runs will drop messages while the machine is this busy" if state is State.WARNING else ""
-    yield Finding(group, "cores", state, f"{cores} to use, load {load:.1f}", hint)
+    hint = "live runs will drop messages while the machine is this busy"
+    yield _graded(group, "cores", load <= 2 * cores, f"{cores} to use, load {load:.1f}", hint)
     memory = psutil.virtual_memory()
-    state = State.WARNING if memory.available < 1 << 30 else State.OK
-    yield Finding(group, "memory", state, f"{_size(memory.available)} of {_size(memory.total)} available")
+    text = f"{_size(memory.available)} of {_size(memory.total)} available"
+    yield _graded(group, "memory", memory.available >= 1 << 30, text)
     governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     if governor == "powersave":
         hint = "cpupower frequency-set -g performance"
         yield Finding(group, "frequency", State.NOTE, "the governor is powersave: firings take longer", hint)
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    state = State.WARNING if soft < 1024 else State.OK
-    hint = "ulimit -n 4096: each pair of processes that talk needs some" if state is State.WARNING else ""
-    yield Finding(group, "open files", state, f"{soft} at most", hint)
+    hint = "ulimit -n 4096: each pair of processes that talk needs some"
+    yield _graded(group, "open files", soft >= 1024, f"{soft} at most", hint)
     free = shutil.disk_usage(Path.cwd()).free
-    state = State.WARNING if free < 1 << 30 else State.OK
-    yield Finding(group, "disk", state, f"{_size(free)} free in the current folder")
+    yield _graded(group, "disk", free >= 1 << 30, f"{_size(free)} free in the current folder")
 
 
 def check_shared_memory() -> Iterator[Finding]:
@@ -95,8 +92,8 @@ def check_ports() -> Iterator[Finding]:
         folder = registry_folder()
         long = len(str(folder)) + SOCKET_NAME > LONGEST_SOCKET
         text = f"{folder} is this user's alone" + ("; its path is too long for sockets" if long else "")
-        hint = "set XDG_RUNTIME_DIR to a folder with a short path" if long else ""
-        yield Finding(group, "folder of running graphs", State.FAULT if long else State.OK, text, hint)
+        hint = "set XDG_RUNTIME_DIR to a folder with a short path"
+        yield _graded(group, "folder of running graphs", not long, text, hint, State.FAULT)
         graphs = ", ".join(f"{graph.name} (process {graph.pid})" for graph in running())
         yield Finding(group, "running graphs", State.OK, graphs or "none")
     except RegistryError as error:
@@ -118,9 +115,8 @@ def check_clocks() -> Iterator[Finding]:
     group = "clocks"
     source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     if source:
-        slow = source not in _STEADY_CLOCKS
-        hint = "reading the time is slow; see the kernel's log for why tsc was left" if slow else ""
-        yield Finding(group, "clock source", State.WARNING if slow else State.OK, source, hint)
+        hint = "reading the time is slow; see the kernel's log for why tsc was left"
+        yield _graded(group, "clock source", source in _STEADY_CLOCKS, source, hint)
     if (kept := wall_clock()) is not None:
         synchronised, error = kept
         if synchronised:
@@ -129,9 +125,8 @@ def check_clocks() -> Iterator[Finding]:
             hint = "timedatectl set-ntp true, or chrony; timestamps of several machines do not compare without"
             yield Finding(group, "wall clock", State.NOTE, "the kernel does not know it to be synchronised", hint)
     worst = max(lateness() for _ in range(20))
-    state = State.WARNING if worst > LATE else State.OK
-    hint = "something keeps the cores busy: live sources will be late" if state is State.WARNING else ""
-    yield Finding(group, "wake-up", state, f"a thread that sleeps wakes up to {worst * 1e3:.2f} ms late", hint)
+    hint = "something keeps the cores busy: live sources will be late"
+    yield _graded(group, "wake-up", worst <= LATE, f"a thread that sleeps wakes up to {worst * 1e3:.2f} ms late", hint)
 
 
 def wall_clock() -> tuple[bool, float] | None:
@@ -174,6 +169,11 @@ def check_display() -> Iterator[Finding]:
         yield Finding(group, "viewer", State.OK, f"Rerun's program is at {executable()}")
     except ViewerError as error:
         yield Finding(group, "viewer", State.WARNING, str(error))
+
+
+def _graded(group: str, about: str, fine: bool, text: str, hint: str = "", worse: State = State.WARNING) -> Finding:
+    """A finding that is `worse`, with a hint, unless all is fine."""
+    return Finding(group, about, State.OK, text) if fine else Finding(group, about, worse, text, hint)
 
 
 def _read(path: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.editing.extras import is_fact, take_over
 from dataflow.editing.joins import Joined
 from dataflow.editing.part import Reading, as_stored, copy_messages, graph_of, kept_stamps, makers_of
 from dataflow.editing.report import Edited, Watch, unwatched
@@ -21,6 +20,7 @@ from dataflow.editing.spool import Spool
 from dataflow.recording import Recorded, Recording
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN, Kind
+from dataflow.recording.mcap.attachments import names_once, tells_of_run
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import Copy, Mask, Origin, framing
 from dataflow.recording.streams.cutting import Cut, cut_of
@@ -30,6 +30,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.sync.stamps import format_stamp
 
 Records = Mapping[str, Iterable[FiringRecord]]
+Items = list[tuple[str, Hashable]]
 
 
 def merge(
@@ -46,7 +47,7 @@ def merge(
     Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
     recordings the run of the first one counts, with its graph and firing records; the others give their streams.
     `prefixes` are put before the names of the streams of each. Attachments and metadata of all go along
-    (`editing.extras`). Files without a message whose writer died are passed over. Raises `RecordingError` for names
+    (`_take_over`). Files without a message whose writer died are passed over. Raises `RecordingError` for names
     that clash.
     """
     done = Edited(str(out))
@@ -70,14 +71,14 @@ def merge(
             _refuse_clashes(origins, prefixes)
             kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
             spool = stack.enter_context(Spool(out.parent, {} if prefixes[0] else _records_of(origins[0])))
-            facts = {name: dict(v) for name, v in origins[0].metadata.items() if is_fact(origins[0], name)}
+            facts = {name: dict(v) for name, v in origins[0].metadata.items() if _is_fact(origins[0], name)}
             _tell_clocks(origins, done)
             _tell_runs(origins, prefixes, done)
         done.firings = spool.calls
         total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
         for name, values in facts.items():
             copy.writer.add_metadata(name, values)
-        take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)
+        _take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)
         spool.write(copy, origins)
         before = 0
         for origin, masks, prefix in zip(origins, kept, prefixes, strict=True):
@@ -90,6 +91,56 @@ def merge(
     with Origin(out) as made:
         done.streams, done.span = {s: n for s, n in sorted(made.counts().items()) if n}, made.span()
     return done
+
+
+def _is_fact(origin: Origin, name: str) -> bool:
+    """Returns whether a metadata record of `origin` describes its run, rather than being added later."""
+    return origin.own and tells_of_run(name)
+
+
+def _take_over(
+    copy: Copy, origins: Sequence[Origin], labels: Sequence[str], done: Edited, *, joined: bool = False
+) -> None:
+    """Writes the attachments of all files, and their metadata records but for those that describe the first one's run.
+
+    What two files hold equally is taken once. Of one name and other content, the later file's is kept as `LABEL/NAME`,
+    with the label of that file, or its stem where that is empty. So are records that describe a later file's run,
+    unless the files are parts of one (`joined`). Renamed ones are noted.
+    """
+    called = [label or origin.path.stem for label, origin in zip(labels, origins, strict=True)]
+    attached: list[Items] = [
+        [(found.name, found.key) for found in map(origin.file.attachment, origin.file.attachments)]
+        for origin in origins
+    ]
+    names = names_once(list(zip(called, attached, strict=True)))
+    for origin, items, chosen in zip(origins, attached, names, strict=True):
+        copy.attachments(origin, chosen)
+        _note_renamed("attachment", origin, [name for name, _ in items], chosen, done)
+    done.attachments = copy.attached
+
+    records = [
+        [
+            (f"{label}/{name}" if _is_fact(origin, name) else name, values)
+            for name, values in origin.records()
+            if not _is_fact(origin, name) or (number and not joined)
+        ]
+        for number, (origin, label) in enumerate(zip(origins, called, strict=True))
+    ]
+    contents: list[Items] = [[(name, tuple(sorted(values.items()))) for name, values in listed] for listed in records]
+    names = names_once(list(zip(called, contents, strict=True)))
+    for origin, listed, chosen in zip(origins, records, names, strict=True):
+        for (_, values), name in zip(listed, chosen, strict=True):
+            if name is not None:
+                copy.writer.add_metadata(name, values)
+        _note_renamed("metadata", origin, [name for name, _ in listed], chosen, done)
+
+
+def _note_renamed(what: str, origin: Origin, names: Sequence[str], chosen: Sequence[str | None], done: Edited) -> None:
+    for name, given in zip(names, chosen, strict=True):
+        if given not in (name, None):
+            done.notes.append(
+                f"{what} {name!r} of {origin.path.name} differs from that of a file before it: kept as {given!r}"
+            )
 
 
 def prefixed(prefix: str, name: str) -> str:
@@ -132,7 +183,7 @@ def _joined_records(origins: Sequence[Origin]) -> Records:
 def _joined_metadata(origins: Sequence[Origin], done: Edited, *, left_out: bool) -> dict[str, dict[str, str]]:
     """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there, and
     no calls are `left_out`."""
-    metadata = {n: dict(values) for o in origins for n, values in o.metadata.items() if is_fact(o, n)}
+    metadata = {n: dict(values) for o in origins for n, values in o.metadata.items() if _is_fact(o, n)}
     metadata.pop(DIGESTS, None)
     ends: dict[str, dict[str, Any]] = {}
     for origin in origins:

@@ -65,12 +65,7 @@ class Recovered:
 
 
 def recover(
-    path: Path,
-    out: Path,
-    *,
-    compression: Compression = "zstd",
-    overwrite: bool = False,
-    watch: Watch = unwatched,
+    path: Path, out: Path, *, compression: Compression = "zstd", overwrite: bool = False, watch: Watch = unwatched
 ) -> Recovered:
     """Writes everything that can be read of `path` into a file with a proper end and an index.
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.execution.completion import complete_outputs, require_complete
 from dataflow.execution.effects.answers import EffectError
 from dataflow.execution.effects.journal import Journal
 from dataflow.execution.failure import RAISED, RESTORE, OperatorFailure
@@ -25,9 +24,10 @@ from dataflow.execution.generators.shared_generators import AT_WORK
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.execution.threads import limit_threads_again
 from dataflow.graph.model import Node
-from dataflow.messages.base import Message, lacking
+from dataflow.messages.base import Message, complete, lacking
 from dataflow.operator import FINDING, Context, Operator, OperatorSpec, OutputError, Outputs, outputs_of
 from dataflow.sync import NEVER, Entry, Firing, InputValue
+from dataflow.sync.entries import entries_of
 
 Place = tuple[int, int]
 """The place of a call that is no firing: (incarnation, stamp)."""
@@ -52,25 +52,22 @@ class Calls:
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
-        try:
-            with AT_WORK.call(self.node.name, NEVER):
-                self._seed(firing_seed(self.seed, self.node.name, NEVER))
-                self.operator.journal_effects(self._effect)
-                self.operator.setup()
-                limit_threads_again()
-                return self._static_outputs()
-        except RAISED as error:
-            raise OperatorFailure(self.node.name, "setup()", error) from error
+        return self._set_up("setup()", self.operator.setup, limit_threads_again)
 
     def static_outputs(self) -> dict[str, Message]:
         """The messages of the static outputs of an operator that is set up. Raises `OperatorFailure`."""
+        return self._set_up("static_outputs()")
+
+    def _set_up(self, when: str, *steps: Callable[[], object]) -> dict[str, Message]:
         try:
             with AT_WORK.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
                 self.operator.journal_effects(self._effect)
+                for step in steps:
+                    step()
                 return self._static_outputs()
         except RAISED as error:
-            raise OperatorFailure(self.node.name, "static_outputs()", error) from error
+            raise OperatorFailure(self.node.name, when, error) from error
 
     def process(self, firing: Firing) -> dict[str, Message]:
         """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
@@ -109,10 +106,8 @@ class Calls:
             self.operator.on_reset(input)
 
     def parameter(self, name: str, value: Any, place: Place) -> Any:
-        """Sets a parameter, which calls `on_parameter()`; its value as validated, in plain form.
-
-        Raises `ParameterError` and what the operator raises.
-        """
+        """Sets a parameter, which calls `on_parameter()`; its value as validated, in plain form. Raises
+        `ParameterError` and what the operator raises."""
         with AT_WORK.call(self.node.name, place[1]):
             self._seed_change(f"param {name}", place)
             self.operator.set_parameter(name, value)
@@ -237,3 +232,44 @@ def interrupted_after(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+def complete_outputs(spec: OperatorSpec, outputs: Mapping[str, Message], firing: Firing) -> None:
+    """Completes what `process()` or `finish()` returned, by port. Raises `OutputError` where the anchor has no frame.
+
+    The anchor is the message that triggered the firing: of joined inputs the first. Merged inputs, and one with
+    `many=True`, may fire at several messages at once, which then need to be of one frame.
+    """
+    for port, message in outputs.items():
+        if missing := lacking(message):
+            complete(message, firing.stamp, _frame(spec, firing, port, message) if missing != ["stamp"] else "")
+
+
+def require_complete(spec: OperatorSpec, outputs: Mapping[str, Message], given_by: str) -> None:
+    """Raises `OutputError` for a message that lacks its stamp or frame where no firing has them."""
+    for port, message in outputs.items():
+        if missing := lacking(message):
+            raise OutputError(
+                f"{spec.name}.{port} emitted {message.SCHEMA} without {' and '.join(missing)}: {given_by} is no "
+                f"firing that has them; give {', '.join(f'{name}=...' for name in missing)}"
+            )
+
+
+def _frame(spec: OperatorSpec, firing: Firing, port: str, message: Message) -> str:
+    anchors: dict[str, Message] = {}
+    for trigger in spec.triggers:
+        anchors |= {e.stream or trigger.name: e.value for e in entries_of(firing.inputs.get(trigger.name))}
+        if anchors and not spec.merge:
+            break
+    frames = {name: getattr(anchor, "frame", None) for name, anchor in anchors.items()}
+    found = set(frames.values())
+    if len(found) == 1 and isinstance(frame := found.pop(), str):
+        return frame
+    if not anchors:
+        why = "finish() has no anchor" if firing.kind == "finish" else "no message triggered the firing, but a tick"
+    elif len(anchors) == 1:
+        (anchor,) = anchors.values()
+        why = f"the anchor, a {anchor.SCHEMA}, has none"
+    else:
+        why = "the messages that triggered it differ: " + ", ".join(f"{n} {frame!r}" for n, frame in frames.items())
+    raise OutputError(f"{spec.name}.{port} emitted {message.SCHEMA} without frame, and {why}; give frame=...")

@@ -9,16 +9,22 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
-from dataflow.execution.absent import without_absent
-from dataflow.execution.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
+from dataflow.execution.admission import (
+    AdmissionQueue,
+    Arrival,
+    Clock,
+    EventClock,
+    EventTime,
+    Patience,
+    Promise,
+    dropped,
+)
 from dataflow.execution.calls import Calls, interrupted_after
-from dataflow.execution.earlier import EarlierCounts
-from dataflow.execution.event_time import EventTime
-from dataflow.execution.failure import RAISED, OperatorFailure
+from dataflow.execution.failure import RAISED, RESTORE, OperatorFailure
 from dataflow.execution.log import FiringLog, unlisted
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
@@ -81,7 +87,9 @@ class LiveRunner(OperatorRunner):
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
-        self._earlier = EarlierCounts()
+        self._earlier_drops: Counter[tuple[str, str]] = Counter()
+        self._earlier_late: Counter[str] = Counter()
+        """Counts of the aligners before the present one: each jump of a clock begins with a new one."""
         self._static = static
         self._statics: dict[str, Entry] = {}
         self._on_failure, self.faults = on_failure, faults
@@ -98,7 +106,7 @@ class LiveRunner(OperatorRunner):
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
         withheld = {(f"→ {port}", "non_monotonic"): n for port, n in self.ports.withheld.items()}
-        return self._earlier.drops + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
+        return self._earlier_drops + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
 
     @property
     def timeouts(self) -> Mapping[str, int]:
@@ -106,7 +114,7 @@ class LiveRunner(OperatorRunner):
 
     @property
     def late(self) -> Mapping[str, int]:
-        return self._earlier.late + Counter(self.aligner.late)
+        return self._earlier_late + Counter(self.aligner.late)
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -164,10 +172,8 @@ class LiveRunner(OperatorRunner):
     # Work
 
     def step(self) -> bool:
-        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough.
-
-        True also after `MOST_TRIED` of the latter without a firing: what has arrived meanwhile is to be looked at.
-        """
+        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough. True also
+        after `MOST_TRIED` of the latter without a firing: what has arrived meanwhile is to be looked at."""
         if self.restarts.pending:
             if self.restarts.due_in() > 0:
                 return False
@@ -190,10 +196,8 @@ class LiveRunner(OperatorRunner):
         return True
 
     def _decide(self) -> bool:
-        """Makes the next firing if it is decided.
-
-        What it emits and promises may come back to itself and decide another one: `_told` is cleared before.
-        """
+        """Makes the next firing if it is decided. Its own emissions and promises may come back and decide another one:
+        `_told` is cleared before."""
         self._told = False
         if not super().step():
             return False
@@ -322,7 +326,7 @@ class LiveRunner(OperatorRunner):
                 return started, calls, kept
             except OperatorFailure as failure:
                 close_quietly(calls.operator)
-                if state is None or failure.when != "restore()":
+                if state is None or failure.when != RESTORE:
                     raise
                 state, kept = None, f"begun anew: {failure.summary}"
 
@@ -358,7 +362,11 @@ class LiveRunner(OperatorRunner):
 
     def _begin_alignment(self) -> None:
         old = self.aligner
-        self._earlier.take(old, self.spec)
+        self._earlier_drops.update(old.drops)
+        self._earlier_late.update(old.late)
+        for held, count in old.buffered().items():
+            if count and self.spec.inputs[held].kind != "sampled":
+                self._earlier_drops[held, "reset"] += count
         self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():
@@ -421,3 +429,22 @@ def _declares_other_ports(before: OperatorSpec, now: OperatorSpec) -> str:
 def _producer(stream: str) -> str:
     """The operator that emits a stream, by the stream's name."""
     return stream.rpartition("/")[0]
+
+
+def without_absent(firing: Firing, node: Node, absent: Collection[str]) -> Firing:
+    """Marks the Sampled inputs stale that take an `absent` stream; drops what they hold where the policy requires it.
+    Required inputs, and inputs of several streams, stay."""
+    ports = node.spec.inputs
+    gone = frozenset(
+        name
+        for name, port in ports.items()
+        if port.kind == "sampled" and any(stream in absent for stream in node.inputs.get(name, ()))
+    )
+    if not gone:
+        return firing
+    inputs = dict(firing.inputs)
+    if node.live.on_stale == "drop":
+        inputs |= {
+            name: None for name in gone if not ports[name].required and not isinstance(inputs.get(name), Mapping)
+        }
+    return Firing(firing.stamp, firing.kind, firing.tick, inputs, firing.stale | gone, firing.late)

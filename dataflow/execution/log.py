@@ -98,11 +98,7 @@ class FiringLog:
         )
 
     def add_setup(
-        self,
-        operator: Operator,
-        started: int,
-        emissions: tuple[Emission | None, ...],
-        code: Code | None = None,
+        self, operator: Operator, started: int, emissions: tuple[Emission | None, ...], code: Code | None = None
     ) -> None:
         """The record of `setup()`: parameters, files, code (by default that which is there) and static messages."""
         detail: dict[str, Any] = {

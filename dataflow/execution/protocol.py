@@ -50,7 +50,7 @@ class Runner:
         """True when it is to be asked for a step."""
         self.place = 0
         self.wakes_in: list[Runner] = []
-        """Its place in the graph and where it puts itself when it wakes (`dataflow.execution.ready`)."""
+        """Its place in the graph and where it puts itself when it wakes (`dataflow.execution.driver`)."""
 
     def wake(self) -> None:
         """Asks to be stepped: something was given that may decide a firing, or there may be another one."""
@@ -75,10 +75,8 @@ class Runner:
         raise NotImplementedError
 
     def step(self) -> bool:
-        """Makes the next firing if it is decided; False when there was nothing to do. Raises `OperatorFailure`.
-
-        Where there may be more to do it wakes.
-        """
+        """Makes the next firing if it is decided; False when there was nothing to do. Raises `OperatorFailure`. Where
+        there may be more to do it wakes."""
         raise NotImplementedError
 
     def next_due(self) -> float | None:
@@ -90,10 +88,8 @@ class Runner:
         return None, {}
 
     def set_parameter(self, name: str, value: Any) -> Any:
-        """Changes a parameter between two firings; recorded. Returns the value as validated.
-
-        Raises `ParameterError` for one that does not exist, cannot change while running, or is out of bounds.
-        """
+        """Changes a parameter between two firings; recorded. Returns the value as validated. Raises `ParameterError`
+        for one that does not exist, cannot change while running, or is out of bounds."""
         raise ParameterError(f"the parameters of {self.node.name!r} cannot change here")
 
     def reload(self) -> dict[str, Any]:

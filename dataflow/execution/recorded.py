@@ -1,7 +1,7 @@
 """Drives an operator by its recorded firings.
 
 They say which messages each call was given, so nothing is decided again: drops, timeouts, lateness and restarts of a
-live run are repeated exactly. A `Judge` compares what comes out, digest by digest.
+live run are repeated exactly. A `Comparator` compares what comes out, digest by digest.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.environments import imported_packages, installed, require_environment
-from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
+from dataflow.execution.comparator import Comparator
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, OperatorFailure
 from dataflow.execution.generators.seeding import VERSION
-from dataflow.execution.judge import Judge
 from dataflow.execution.memory import WATCHED, MemoryGuard
 from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.execution.restarts import close_quietly
+from dataflow.execution.runner import align_spec
 from dataflow.graph.code import code_now, stored_operator
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
@@ -69,7 +69,7 @@ class RecordedRunner(Runner):
         self._watcher = watcher or Watcher()
         self.effects = RecordedJournal(make=make_effects)
         self.calls = Calls(node, self.operator, seed, version=seeding, effects=self.effects)
-        self.judge = Judge(node.name, tuple(self.ports.states), inputs)
+        self.comparator = Comparator(node.name, tuple(self.ports.states), inputs)
         self._repetition = repetition
         self.result.began = self._repetition.began
         self.result.unknown, self.result.lost_records = self._repetition.unknown, self._repetition.lost
@@ -80,7 +80,8 @@ class RecordedRunner(Runner):
         self._ahead = iter(self._repetition)
         self.record = self._repetition.setup
         """The record that is repeated now, or was last."""
-        self._next = next(self._ahead, None)
+        self.next_record = next(self._ahead, None)
+        """The record that is repeated next; None behind the last one."""
         self._inputs: FiringInputs | None = None
         """Of the next call, once it is its turn."""
         self.changed: dict[str, Any] = {}
@@ -90,23 +91,18 @@ class RecordedRunner(Runner):
     @property
     def result(self) -> Verification:
         """Returns what re-execution has come to so far."""
-        return self.judge.result
-
-    @property
-    def next_record(self) -> FiringRecord | None:
-        """The record that is repeated next; None behind the last one."""
-        return self._next
+        return self.comparator.result
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
         self._watcher.begins("setup", self.node.name)
         statics = self.calls.setup()
         if (record := self._repetition.setup) is not None:
-            self.judge.files(record, self.operator.files)
+            self.comparator.files(record, self.operator.files)
             then = record.detail.get("packages", {})
-            self.judge.packages(then, {name: installed(name) for name in then} or imported_packages())
+            self.comparator.packages(then, {name: installed(name) for name in then} or imported_packages())
             self._look_at_code(record)
-            for name, message, seq in self.judge.outputs(record, statics):
+            for name, message, seq in self.comparator.outputs(record, statics):
                 self.ports.emit_as(name, message, seq, record.incarnation)
         self._take_up()
         self.ports.end_statics()
@@ -121,7 +117,7 @@ class RecordedRunner(Runner):
         if again:
             statics = self._make_anew(again[-1].incarnation)
             if again[-1].kind == "setup":
-                self.judge.statics(again[-1], statics)
+                self.comparator.statics(again[-1], statics)
             self._look_at_code(again[-1])
         self._change(changes, again[-1].incarnation if again else 0)
         if before and is_known(last := before[-1]):
@@ -144,8 +140,8 @@ class RecordedRunner(Runner):
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
-        if self._next is not None and not self.ended and self.aligner.takes(stream, entry):
-            self.judge.arrived(stream, entry)
+        if self.next_record is not None and not self.ended and self.aligner.takes(stream, entry):
+            self.comparator.arrived(stream, entry)
             self.aligner.push(stream, entry)
         if not self.awake:
             self.wake()
@@ -171,7 +167,7 @@ class RecordedRunner(Runner):
 
     def _make_next(self) -> bool:
         self._repeat_changes()
-        record = self._next
+        record = self.next_record
         if record is not None and self._inputs is None:
             self._inputs = record.firing()
         firing = None if self._inputs is None else self.aligner.take(self._inputs)
@@ -191,12 +187,12 @@ class RecordedRunner(Runner):
 
     def _advance(self) -> None:
         """Reads the next record."""
-        self._next, self._inputs = next(self._ahead, None), None
+        self.next_record, self._inputs = next(self._ahead, None), None
 
     def _repeat_changes(self) -> None:
         """Returns what happened to the operator between the last firing and the next, in its recorded order."""
-        while self._next is not None and self._next.kind not in CALLS:
-            self.record = record = self._next
+        while self.next_record is not None and self.next_record.kind not in CALLS:
+            self.record = record = self.next_record
             self._advance()
             place = (record.incarnation, record.stamp)
             match record.kind:
@@ -205,7 +201,7 @@ class RecordedRunner(Runner):
                 case "param" | "reset":
                     self._attempt(record)
                 case "snapshot":
-                    self.judge.state(record, self.calls.snapshot(place))
+                    self.comparator.state(record, self.calls.snapshot(place))
                 case "restore":
                     self._restore(record)
                 case "cut":
@@ -213,14 +209,14 @@ class RecordedRunner(Runner):
 
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
-        self.judge.statics(record, self._make_anew(record.incarnation))
+        self.comparator.statics(record, self._make_anew(record.incarnation))
         self._look_at_code(record)
 
     def _look_at_code(self, record: FiringRecord) -> None:
         """Notes code that is not as it was, unless what a reload has replaced runs."""
         if not self._as_it_was:
             then = code_in(record) or {}
-            self.judge.code(then, code_now(type(self.operator), then).digests)
+            self.comparator.code(then, code_now(type(self.operator), then).digests)
 
     def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
         """A fresh operator, with the parameters as they were last set; its static messages."""
@@ -249,23 +245,23 @@ class RecordedRunner(Runner):
     def _attempt(self, record: FiringRecord) -> None:
         """Changes a parameter, or resets; compares what that raises."""
         place, detail = (record.incarnation, record.stamp), record.detail
+        error: BaseException | None = None
         try:
             if record.kind == "param":
                 self.changed[detail["name"]] = detail["value"]
                 self.calls.parameter(detail["name"], detail["value"], place)
             else:
                 self.calls.reset(detail["input"], place)
-        except RAISED as error:
-            self.judge.error(record, error)
-        else:
-            self.judge.error(record, None)
+        except RAISED as raised:
+            error = raised
+        self.comparator.error(record, error)
 
     def _restore(self, record: FiringRecord) -> None:
         """A replay that began in the middle: with this state, or with one that is unavailable."""
         state = record.detail["state"]
         if state is None:
             self.result.lost_records += self._calls_left
-            self._calls_left, self._next = 0, None
+            self._calls_left, self.next_record = 0, None
             self.aligner = RecordedAligner(self._align_spec, Uses())
             return
         self._take_over(state, record)
@@ -285,7 +281,7 @@ class RecordedRunner(Runner):
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp of the next firing, and the stream and number of the message that it waits for."""
         missing = self.aligner.missing()
-        stamp = None if self._next is None else self._next.stamp
+        stamp = None if self.next_record is None else self.next_record.stamp
         return stamp, {} if missing is None else {missing.stream: missing.seq}
 
     def needs_from(self) -> dict[str, tuple[int, int]]:
@@ -296,7 +292,7 @@ class RecordedRunner(Runner):
         raise ParameterError("the parameters of a re-execution are the recorded ones")
 
     def _fire(self, firing: Firing, record: FiringRecord) -> None:
-        self.judge.given(record, firing)
+        self.comparator.given(record, firing)
         if record.detail.get("injected"):  # a fault that was tried out: the operator was not called
             self.result.verified += 1
             return
@@ -309,16 +305,16 @@ class RecordedRunner(Runner):
             if record.outcome == "error":
                 self.ports.check(messages, firing.stamp)
         except RAISED as error:
-            self.judge.error(record, error)
+            self.comparator.error(record, error)
             messages = {}
         else:
-            self.judge.error(record, None)
+            self.comparator.error(record, None)
         if watched and (what := self._guard.changed(self.node.name)):
             self.result.wrote = self.result.wrote or what
-        for name, message, seq in self.judge.outputs(record, messages):
+        for name, message, seq in self.comparator.outputs(record, messages):
             self.ports.emit_as(name, message, seq, record.incarnation)
         if "summary" in record.detail:
-            self.judge.summary(record, self.calls.summary((record.incarnation, record.stamp)))
+            self.comparator.summary(record, self.calls.summary((record.incarnation, record.stamp)))
         if self.effects.counts:
             self.result.effects = self.effects.summary()
         self.firings += record.kind != "finish"

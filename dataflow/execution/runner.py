@@ -12,7 +12,6 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.execution.align import align_spec
 from dataflow.execution.calls import Calls
 from dataflow.execution.failure import RAISED, InputMutated, OperatorFailure, TooManyTicks
 from dataflow.execution.log import FiringLog, unlisted
@@ -21,10 +20,22 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Runner
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
-from dataflow.operator import Operator
+from dataflow.operator import Operator, OperatorSpec
 from dataflow.records.firing import MAX_STATE_BYTES, Emission, Kind
 from dataflow.records.spacing import StateSpacing
-from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
+from dataflow.sync import (
+    FOREVER,
+    NEVER,
+    AlignSpec,
+    BatchSpec,
+    Drop,
+    Entry,
+    Firing,
+    SampledSpec,
+    TriggerSpec,
+    format_duration,
+    format_stamp,
+)
 from dataflow.sync.single import make_aligner
 
 MOST_TICKS = 1_000_000
@@ -253,3 +264,31 @@ class OperatorRunner(Runner):
             dropped = tuple(listed)
             detail |= unlisted(more)
         self.records.add_firing(kind, started, firing, outputs, "ok" if error is None else "error", dropped, detail)
+
+
+def align_spec(node: Node, spec: OperatorSpec, static: frozenset[str]) -> AlignSpec:
+    """The alignment of one operator; `static` names the graph's static streams. An input left unwired takes no part."""
+    triggers: list[TriggerSpec] = []
+    sampled: list[SampledSpec] = []
+    batches: list[BatchSpec] = []
+    for name, port in spec.inputs.items():
+        streams = node.inputs.get(name, ())
+        if not streams:
+            continue
+        if port.kind == "in":
+            triggers.append(TriggerSpec(name, streams, port.many))
+        elif port.kind == "sampled":
+            sampled.append(SampledSpec(name, streams, port.max_age, port.required, port.before or None, port.many))
+        else:
+            batches.append(BatchSpec(name, streams, port.max, port.max_age, port.many))
+    merged = spec.merge
+    joined = len(triggers) > 1 and not merged
+    return AlignSpec(
+        triggers=tuple(triggers),
+        sampled=tuple(sampled),
+        batches=tuple(batches),
+        mode="merge" if merged else "join",
+        tolerance=node.tolerance if joined else 0,
+        every=node.every,
+        static=static & node.taken,
+    )

@@ -8,9 +8,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from dataflow.execution.calls import Calls
+from dataflow.execution.calls import Calls, require_complete
 from dataflow.execution.clock_correction import ClockCorrection
-from dataflow.execution.completion import require_complete
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import change_seed, seed_generators
@@ -83,9 +82,7 @@ class SourceRunner:
 
     def take(self) -> dict[str, Message] | None:
         """The next step without emitting it, None at the end: for the thread that reads a source in a live run.
-
-        `check_draws` is to follow, as soon as the step is on its way.
-        """
+        `check_draws` is to follow, as soon as the step is on its way."""
         step, self._next = self._next, None
         if step is not None:
             return step
@@ -245,10 +242,8 @@ class SourceRunner:
             self.operator.set_parameter(name, value)
 
     def set_parameter(self, name: str, value: Any) -> Any:
-        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`.
-
-        No generator is seeded: `stream()` goes on with what it has drawn, and no source is re-executed.
-        """
+        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`. No generator is
+        seeded: `stream()` goes on with what it has drawn, and no source is re-executed."""
         started = time.time_ns()
         self.operator.set_parameter(name, value)
         self._changed[name] = value

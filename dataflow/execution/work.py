@@ -19,10 +19,8 @@ PREEMPTED = 1_000_000
 
 
 class Work:
-    """Adds up the time (ns) between `begin` and `end`, or spent in `with` blocks.
-
-    Of one `Work` these do not nest, and belong to one thread.
-    """
+    """Adds up the time (ns) between `begin` and `end`, or spent in `with` blocks. Of one `Work` these do not nest, and
+    belong to one thread."""
 
     __slots__ = ("_calls", "_cpu", "_exact", "_wall", "cpu_ns", "mean_ns", "wall_ns")
 
@@ -43,11 +41,8 @@ class Work:
         return now
 
     def end(self) -> None:
-        """Adds up what `begin` has begun.
-
-        A short call that was not preempted has taken as much CPU time as wall time; one that may have been, at most
-        what the thread has taken since its CPU clock was last asked.
-        """
+        """Adds up what `begin` has begun. A short call that was not preempted has taken as much CPU time as wall time;
+        one that may have been, at most what the thread has taken since its CPU clock was last asked."""
         if self._exact:
             self.cpu_ns += time.thread_time_ns() - self._cpu
             wall = time.monotonic_ns() - self._wall

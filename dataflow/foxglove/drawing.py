@@ -26,6 +26,7 @@ from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
 import dataflow.messages as messages
+from dataflow.messages.detection import labels_of
 from dataflow.recording.streams.codecs import SchemaText, codec_for
 from dataflow.recording.streams.foxglove import file_descriptor_set
 from dataflow.recording.streams.foxglove.values import pose_of, timestamp_of
@@ -63,11 +64,7 @@ def limbs_over(m: messages.Keypoints2D) -> ImageAnnotations:
     ends = [Point2(x=x, y=y) for x, y in m.limbs().reshape(-1, 2).tolist()]
     made.points.append(
         PointsAnnotation(
-            timestamp=made.timestamp,
-            type=PointsAnnotation.LINE_LIST,
-            points=ends,
-            outline_color=_GREEN,
-            thickness=2.0,
+            timestamp=made.timestamp, type=PointsAnnotation.LINE_LIST, points=ends, outline_color=_GREEN, thickness=2.0
         )
     )
     return made
@@ -80,11 +77,7 @@ def _rim(made: ImageAnnotations, mask: npt.NDArray[np.bool_]) -> PointsAnnotatio
     rows, columns = np.nonzero(mask & ~inner)
     points = [Point2(x=x + 0.5, y=y + 0.5) for x, y in zip(columns.tolist(), rows.tolist(), strict=True)]
     return PointsAnnotation(
-        timestamp=made.timestamp,
-        type=PointsAnnotation.POINTS,
-        points=points,
-        outline_color=_GREEN,
-        thickness=1.0,
+        timestamp=made.timestamp, type=PointsAnnotation.POINTS, points=points, outline_color=_GREEN, thickness=1.0
     )
 
 
@@ -143,8 +136,7 @@ def tracks(m: messages.Tracks) -> SceneUpdate:
 def scene_graph(m: messages.SceneGraph) -> SceneUpdate:
     """Cubes with names, and a line with its predicate for each relation."""
     made, entity = _scene(m.stamp, m.frame)
-    classes = (m.class_names[c] if m.class_names else str(c) for c in m.class_ids.tolist())
-    for i, label in enumerate(m.labels or classes):
+    for i, label in enumerate(m.labels or labels_of(m.class_ids, m.class_names)):
         turn = _UPRIGHT if m.orientations is None else m.orientations[i]
         _cube(entity, m.positions[i], turn, m.sizes[i], label)
     for subject, predicate, other in zip(m.subjects.tolist(), m.predicates, m.objects.tolist(), strict=True):
@@ -273,7 +265,7 @@ def schema_of(message: messages.Message) -> tuple[SchemaText, str]:
     drawn = drawing_of(message)
     if drawn is None:
         codec = codec_for(type(message))
-        return codec.schema(), codec.message_encoding
+        return codec.schema, codec.message_encoding
     return SchemaText(str(drawn.proto.DESCRIPTOR.full_name), "protobuf", file_descriptor_set(drawn.proto)), "protobuf"
 
 

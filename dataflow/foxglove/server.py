@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 from dataflow.extras import missing_extra
@@ -27,7 +26,8 @@ class Topics:
 
     def of(self, stream: str, message: Message) -> Iterator[tuple[str, Message]]:
         """Yields what is shown for a message: topic and message, its own last."""
-        for transforms in self._frames.transforms(stream, message):
+        transforms = self._frames.transforms(stream, message)
+        if transforms is not None:
             yield FRAMES, transforms
         yield f"/{stream.removeprefix(self._prefix).lstrip('/')}", message
 
@@ -116,9 +116,7 @@ class FoxgloveServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _open(self, key: tuple[str, type[Message], Drawn | None], message: Message) -> Any:

@@ -120,11 +120,8 @@ def surpluses(bag: Bag) -> list[str]:
 def _counts(bag: Bag) -> Iterator[tuple[str, int, int]]:
     """Of each topic that is promised: its name, how many messages are promised, and how many are there."""
     for name, promised in sorted(bag.promised.items()):
-        yield (
-            name,
-            promised,
-            sum(t.count for t in bag.topics.values() if t.name == name or t.name.startswith(f"{name} (")),
-        )
+        held = sum(t.count for t in bag.topics.values() if t.name == name or t.name.startswith(f"{name} ("))
+        yield name, promised, held
 
 
 def _promise(name: str, promised: int, held: int) -> str:

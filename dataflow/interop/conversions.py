@@ -62,22 +62,12 @@ def image16_of(message: CompressedImage) -> Image16:
     return Image16(stamp=message.stamp, frame=message.frame, data=rgb(pixels))
 
 
-def upper_bits(message: Image16) -> Image:
-    """The upper 8 of 16 bits."""
-    return Image(stamp=message.stamp, frame=message.frame, data=(message.data >> 8).astype(np.uint8))
-
-
 def depth_in_millimetres(message: Image16) -> DepthImage:
     """Depth that a device sends as grey values, in millimetres; 0 stays no return."""
     if message.data.ndim != 2:
         raise RecordingError("an image of three channels is no depth")
     metres = as_depth("16UC1", message.data)
     return DepthImage(stamp=message.stamp, frame=message.frame, data=metres)
-
-
-def depth_of_grey(message: CompressedImage) -> DepthImage:
-    """Decodes a PNG of 16-bit grey values, which are millimetres."""
-    return depth_in_millimetres(image16_of(message))
 
 
 def in_units(message: Message, scale: float) -> Message:
@@ -93,38 +83,19 @@ def in_units(message: Message, scale: float) -> Message:
     return message.replace(data=(raw / scale).astype(np.float32))
 
 
-def number_of(message: Measurement) -> Number:
-    """The value and its unit."""
-    return Number(stamp=message.stamp, value=message.value, unit=message.unit)
-
-
-def distance_of(message: RangeReading) -> Number:
-    """The distance alone, metres."""
-    return Number(stamp=message.stamp, value=message.range, unit="m")
-
-
 def pose_of(message: Odometry) -> Pose:
     """The pose alone."""
-    return Pose(
-        stamp=message.stamp,
-        frame=message.frame,
-        child_frame=message.child_frame,
-        position=message.position,
-        orientation=message.orientation,
-        covariance=message.pose_covariance,
-    )
+    return Pose(**_placed(message), covariance=message.pose_covariance)
 
 
 def odometry_of(message: Pose) -> Odometry:
     """A pose as odometry without velocities."""
-    return Odometry(
-        stamp=message.stamp,
-        frame=message.frame,
-        child_frame=message.child_frame,
-        position=message.position,
-        orientation=message.orientation,
-        pose_covariance=message.covariance,
-    )
+    return Odometry(**_placed(message), pose_covariance=message.covariance)
+
+
+def _placed(message: Pose | Odometry) -> dict[str, Any]:
+    names = ("stamp", "frame", "child_frame", "position", "orientation")
+    return {name: getattr(message, name) for name in names}
 
 
 def decoded(data: Any, format_: str) -> Any:
@@ -150,11 +121,11 @@ CONVERSIONS: dict[tuple[type[Message], type[Message]], Callable[[Any], Message]]
     (CompressedImage, Image): image_of,
     (CompressedDepth, DepthImage): depth_of,
     (CompressedImage, Image16): image16_of,
-    (CompressedImage, DepthImage): depth_of_grey,
-    (Image16, Image): upper_bits,
+    (CompressedImage, DepthImage): lambda m: depth_in_millimetres(image16_of(m)),
+    (Image16, Image): lambda m: Image(stamp=m.stamp, frame=m.frame, data=(m.data >> 8).astype(np.uint8)),
     (Image16, DepthImage): depth_in_millimetres,
-    (Measurement, Number): number_of,
-    (RangeReading, Number): distance_of,
+    (Measurement, Number): lambda m: Number(stamp=m.stamp, value=m.value, unit=m.unit),
+    (RangeReading, Number): lambda m: Number(stamp=m.stamp, value=m.range, unit="m"),
     (Odometry, Pose): pose_of,
     (Pose, Odometry): odometry_of,
 }

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from dataflow.interop.bag import Bag, BagError, shortfalls, surpluses
+from dataflow.interop.joined_bag import JoinedBag
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.interop.unpacking import Unpacked, unpack, unpacked_head
+from dataflow.interop.unpacking import unpack, unpacked_head
 from dataflow.recording.beginnings import RERUN_MAGICS, ROS1_MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, beginning, head_of
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import PROGRAM
@@ -100,7 +102,7 @@ def is_ros_bag(path: Path) -> bool:
     return path.is_file() and head_of(path).startswith((ROS1_MAGIC, SQLITE_MAGIC))
 
 
-def _ros_bag(path: Path, files: list[Path], strict: bool) -> Bag:
+def _ros_bag(path: Path, files: list[Path], strict: bool) -> JoinedBag[Any]:
     """Opens a ROS 1 bag; several files where their names say that they are parts of one (`rosbag record --split`)."""
     from dataflow.interop.ros_bags import RosBag  # rosbags takes long to import, and most files are no such bags
 
@@ -152,7 +154,7 @@ def _of_files(path: Path, suffix: str, files: list[Path], strict: bool, *, compr
 
     unpacked = unpack(files, strict=strict)
 
-    def opened(some: list[Path]) -> Bag:
+    def opened(some: list[Path]) -> JoinedBag[Any]:
         if suffix == ".bag":
             return _ros_bag(path, some, strict)
         return (McapBag if suffix == ".mcap" else Db3Bag)(path, some, compressed=compressed, strict=strict)
@@ -169,10 +171,12 @@ def _of_files(path: Path, suffix: str, files: list[Path], strict: bool, *, compr
         unpacked.close()
         raise
     bag.lost.parts += [*unpacked.damage, *left_out]
-    return Unpacked(bag, unpacked) if unpacked.copies is not None else bag
+    bag.closing.callback(unpacked.close)
+    bag.kind += ", zstd" if unpacked.copies is not None else ""
+    return bag
 
 
-def _sound(files: list[Path], opened: Callable[[list[Path]], Bag]) -> tuple[list[Path], list[str]]:
+def _sound(files: list[Path], opened: Callable[[list[Path]], JoinedBag[Any]]) -> tuple[list[Path], list[str]]:
     """Those of several files that can be opened, and why others are left out."""
     sound, broken = [], []
     for file in files:

@@ -38,10 +38,11 @@ Row = tuple[int, int, bytes]
 class Wreck:
     """The messages that are left of a broken file: their places, and what one holds when it is asked for.
 
-    `encoding`: of messages; `lost`: how many lack a part, as far as that shows; `notes`: for people.
+    `encoding`: of messages; `lost`: how many lack a part, as far as that shows; `notes`: for people; `parts`: what it
+    is read by.
     """
 
-    encoding = ""
+    encoding, parts = "", "records"
 
     def __init__(self, path: Path) -> None:
         self.path, self.lost = path, 0
@@ -115,7 +116,7 @@ def salvage(path: Path) -> Wreck:
 class DatabaseWreck(Wreck):
     """Pages of a database, the last ones missing or some damaged. Raises `RecordingError` without a sound header."""
 
-    encoding = "cdr"
+    encoding, parts = "cdr", "pages"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,9 +16,8 @@ from dataflow.interop.account import Account
 from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
-from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
-from dataflow.interop.ranking import Ranking, within
+from dataflow.interop.ranking import Found, Ranking, within
 from dataflow.interop.topics import Reading
 from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
@@ -71,6 +70,7 @@ class BagStreams:
         try:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
             self._readings = {p.topic: self._reading(p) for p in self.played.values()}
+            self._readers = {topic: r.reader for topic, r in self._readings.items() if r.reader is not None}
             self._unstamped: dict[str, Unread] = {}
             self._depths: dict[str, list[npt.NDArray[np.float32]]] = {}
             self._moving = sorted({p.topic for p in self.played.values() if not p.static})
@@ -194,10 +194,8 @@ class BagStreams:
     def _scan(self, watch: Callable[[int], None] | None) -> dict[str, Found]:
         found = {topic: Found() for topic in self._moving}
         for seen, stored in enumerate(self._bag.messages(self._moving), 1):
-            reader = self._readings[stored.topic].reader
-            assert reader is not None
             try:
-                stamps = reader.stamps(stored.data)
+                stamps = self._readers[stored.topic].stamps(stored.data)
             except (RecordingError, MessageError) as error:
                 self._pass_over(stored, error)
                 continue
@@ -215,7 +213,7 @@ class BagStreams:
         changed: dict[str, int] = {}
         for stored in self._bag.messages([played.topic]):
             count += 1
-            for message in self._parts(played, stored):
+            for message in self._read(played, stored, max(stored.log_time, 0)):
                 if isinstance(message, Transforms):
                     for child, place in places_of(message):
                         if given.setdefault(child, place) != place:
@@ -238,23 +236,6 @@ class BagStreams:
         if differing or changed:
             self.account.static[played.topic] = told
         return first
-
-    def _parts(self, played: Played, stored: Stored) -> list[Message]:
-        """All parts of a message as the type that is played; none where it cannot be read."""
-        reader = self._readings[played.topic].reader
-        assert reader is not None
-        losses: list[str] | None = [] if self._accounting else None
-        try:
-            parts = range(max(1, len(reader.stamps(stored.data))))
-            stamp = max(stored.log_time, 0)
-            read = [reader.read(stored.data, part, stamp, losses) for part in parts]
-            made = [in_units(convert(message, message_type(played.type)), played.depth_scale) for message in read]
-        except (RecordingError, MessageError) as error:
-            self._pass_over(stored, error)
-            return []
-        if losses:
-            self.account.lose(played.topic, losses)
-        return made
 
     def _info(self, stream: str) -> StreamInfo:
         played = self.played[stream]
@@ -282,7 +263,7 @@ class BagStreams:
         plan = Ranking({s: self.played[s].topic for s in streams}, self._found, self.repairs, start, end)
         waiting: list[tuple[int, int, int, Stored]] = []
         held = due = 0
-        pending: _Pending | None = None
+        pending: Recorded | None = None
         self.account.unread = dict(self._unstamped)
         self.account.lost = {topic: lost for topic, lost in self.account.lost.items() if topic not in plan.topics}
         behind: dict[str, int] = {}
@@ -301,48 +282,45 @@ class BagStreams:
                 held -= len(ready.data)
                 due += 1
                 stream, stamp, seq = plan.place(rank)
-                message = self._read(stream, ready, part, stamp)
-                if message is None:
+                found = self._read(self.played[stream], ready, stamp, part)
+                if not found:
                     behind[stream] = behind.get(stream, 0) + 1
                     continue
-                seq -= behind.get(stream, 0)
-                if pending is not None and (pending.stream, pending.message.stamp) == (stream, stamp):
+                message = found[0]
+                if pending is not None and (pending.stream, pending.stamp) == (stream, stamp):
                     assert isinstance(pending.message, Transforms)
                     assert isinstance(message, Transforms)
                     if self._accounting and (lost := other_parents(pending.message, message)):
                         self.account.lose(self.played[stream].topic, lost)
-                    pending.message = joined(pending.message, message)
+                    pending = replace(pending, message=joined(pending.message, message))
                     continue
                 if pending is not None:
-                    yield pending.done()
-                pending = _Pending(stream, message, seq)
+                    yield pending
+                pending = Recorded(stream, message, seq - behind.get(stream, 0), 0)
         if pending is not None:
-            yield pending.done()
+            yield pending
         for topic, depths in self._depths.items():
             if (span := DepthSpan.of(np.concatenate(depths), 1.0)) and (doubt := span.doubt()):
                 self.account.doubted[topic] = f"{doubt}: --depth {topic}=UNITS sets the units of a metre"
 
-    def _read(self, stream: str, stored: Stored, part: int, stamp: int) -> Message | None:
-        """The message as the type that is played; None for one that cannot be read."""
-        played = self.played[stream]
-        reader = self._readings[played.topic].reader
-        assert reader is not None
+    def _read(self, played: Played, stored: Stored, stamp: int, part: int | None = None) -> list[Message]:
+        """A part of a message as the type that is played, or all of them; none where it cannot be read."""
+        reader, wanted = self._readers[played.topic], message_type(played.type)
         losses: list[str] | None = [] if self._accounting else None
-        wanted = message_type(played.type)
         try:
-            read = reader.read(stored.data, part, stamp, losses)
-            message = in_units(convert(read, wanted), played.depth_scale)
+            parts = range(max(1, len(reader.stamps(stored.data)))) if part is None else (part,)
+            read = [reader.read(stored.data, number, stamp, losses) for number in parts]
+            made = [in_units(convert(message, wanted), played.depth_scale) for message in read]
         except (RecordingError, MessageError) as error:
             self._pass_over(stored, error)
-            return None
+            return []
         if losses is not None:
-            if (lost := NARROWING.get((type(read), wanted))) is not None:
-                losses.append(lost)
+            losses += [NARROWING[types] for message in read if (types := (type(message), wanted)) in NARROWING]
             if losses:
                 self.account.lose(played.topic, losses)
-            if isinstance(message, DepthImage) and not stored.number & (stored.number - 1):  # 1, 2, 4, 8 ...
-                self._depths.setdefault(played.topic, []).append(message.data[::8, ::8].ravel())
-        return message
+            if isinstance(made[0], DepthImage) and not stored.number & (stored.number - 1):  # 1, 2, 4, 8 ...
+                self._depths.setdefault(played.topic, []).append(made[0].data[::8, ::8].ravel())
+        return made
 
     def _pass_over(self, stored: Stored, error: Exception) -> None:
         """Counts a message that cannot be read; raises `BagError` where that is not allowed."""
@@ -351,16 +329,6 @@ class BagStreams:
                 f"{self.path}: topic {stored.topic!r}, message {stored.number} at {stored.log_time}: {error}"
             ) from error
         self.account.pass_over(stored.topic, f"number {stored.number} at {stored.log_time}: {error}")
-
-
-@dataclass(slots=True)
-class _Pending:
-    stream: str
-    message: Message
-    seq: int
-
-    def done(self) -> Recorded:
-        return Recorded(self.stream, self.message, self.seq, 0)
 
 
 def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording | BagStreams:

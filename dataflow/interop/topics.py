@@ -11,7 +11,6 @@ from typing import Any, Protocol
 from dataflow.interop.bag import Bag, Topic
 from dataflow.interop.ros import CONVERSIONS, TRANSFORM_SETS, Convert
 from dataflow.interop.ros.clouds import point_cloud
-from dataflow.interop.ros.objects import array_stamp
 from dataflow.interop.ros.poses import transforms
 from dataflow.interop.ros.sensors import number
 from dataflow.interop.ros.values import time_ns
@@ -69,7 +68,27 @@ class RosReader:
 
     def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
         """The message."""
-        return _converted(self._convert, self._kind, data, stamp, losses)
+        parsed = self._kind.parse(data)
+        try:
+            if losses is None:
+                return self._convert(parsed, stamp)
+            seen = Seen(parsed)
+            made = self._convert(seen, stamp)
+            losses += seen.unread()
+            return made
+        except (ValueError, TypeError, AttributeError, IndexError, ArithmeticError) as error:
+            if isinstance(error, MessageError):
+                raise
+            raise RecordingError(f"a {self._kind.name} whose fields contradict each other: {error}") from error
+
+
+class MarkerArrayReader(RosReader):
+    """Reads marker arrays, which are stamped like their first marker."""
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The time of its first marker."""
+        markers = self._kind.parse(data).markers
+        return (time_ns(markers[0].header.stamp),) if markers else ()
 
 
 class TransformSetReader:
@@ -102,38 +121,6 @@ def _sets(rows: Any) -> list[tuple[int, list[Any]]]:
             known.append(parent)
         found.setdefault((time, known.index(parent) if parent in known else 0), []).append(row)
     return [(time, found[time, number]) for time, number in sorted(found)]
-
-
-class MarkerArrayReader:
-    """Reads marker arrays, which are stamped like their first marker."""
-
-    def __init__(self, kind: RosType) -> None:
-        self._kind = kind
-        self._convert = CONVERSIONS[kind.name][1]
-
-    def stamps(self, data: Data) -> tuple[int, ...]:
-        """The time of its first marker."""
-        found = array_stamp(self._kind.parse(data))
-        return () if found is None else (found,)
-
-    def read(self, data: Data, part: int, stamp: int, losses: list[str] | None = None) -> Message:
-        """The message."""
-        return _converted(self._convert, self._kind, data, stamp, losses)
-
-
-def _converted(convert: Convert, kind: RosType, data: Data, stamp: int, losses: list[str] | None) -> Message:
-    parsed = kind.parse(data)
-    try:
-        if losses is None:
-            return convert(parsed, stamp)
-        seen = Seen(parsed)
-        made = convert(seen, stamp)
-        losses += seen.unread()
-        return made
-    except (ValueError, TypeError, AttributeError, IndexError, ArithmeticError) as error:
-        if isinstance(error, MessageError):
-            raise
-        raise RecordingError(f"a {kind.name} whose fields contradict each other: {error}") from error
 
 
 class ForeignReader:
@@ -173,14 +160,13 @@ def _ros_reader(topic: Topic) -> TopicReader:
     kind = RosType(name, topic.encoding, topic.schema)
     if name in TRANSFORM_SETS:
         return TransformSetReader(kind)
-    if name == "visualization_msgs/msg/MarkerArray":
-        return MarkerArrayReader(kind)
     convert = CONVERSIONS[name][1]
     if convert is point_cloud and topic.count > 1 and topic.first is not None and topic.last is not None:
         convert = partial(point_cloud, period=(topic.last - topic.first) * 1e-9 / (topic.count - 1))
     elif convert is number and (unit := topic.channel.get(UNIT)):
         convert = partial(number, unit=unit)
-    return RosReader(kind, topic.encoding == "ros1", convert)
+    reader = MarkerArrayReader if name == "visualization_msgs/msg/MarkerArray" else RosReader
+    return reader(kind, topic.encoding == "ros1", convert)
 
 
 def is_known(topic: Topic) -> bool:

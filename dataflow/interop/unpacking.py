@@ -1,20 +1,19 @@
-"""Unpacks the files of bags that are compressed as whole files."""
+"""Unpacks bags that are compressed: as whole files, or message by message."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import zstandard
 
-from dataflow.interop.bag import Bag, BagError, Stored, Topic
-from dataflow.interop.mcap_bag import McapBag
+from dataflow.interop.bag import BagError
 from dataflow.interop.ros2_folder import COMPRESSED
 from dataflow.recording.beginnings import HEAD_BYTES, ZSTD_MAGIC, head_of
-from dataflow.recording.mcap.index import McapFile
 
 
 @dataclass(slots=True)
@@ -32,34 +31,6 @@ class Plain:
         """Deletes the copies. Idempotent."""
         if self.copies is not None:
             self.copies.cleanup()
-
-
-class Unpacked:
-    """A bag of unpacked copies, which are deleted when it is closed."""
-
-    def __init__(self, bag: Bag, plain: Plain) -> None:
-        self._bag, self._plain = bag, plain
-        self.path, self.kind = bag.path, f"{bag.kind}, zstd"
-        self.notes, self.promised, self.lost = bag.notes, bag.promised, bag.lost
-
-    @property
-    def topics(self) -> Mapping[str, Topic]:
-        """The topics by name, in alphabetical order."""
-        return self._bag.topics
-
-    @property
-    def files(self) -> Sequence[McapFile]:
-        """The MCAP files; none of other kinds."""
-        return self._bag.files if isinstance(self._bag, McapBag) else ()
-
-    def messages(self, topics: Collection[str]) -> Iterator[Stored]:
-        """Every message of some topics, in the order of log times."""
-        return self._bag.messages(topics)
-
-    def close(self) -> None:
-        """Closes and deletes the copies. Idempotent."""
-        self._bag.close()
-        self._plain.close()
 
 
 def unpack(files: Sequence[Path], *, strict: bool = False) -> Plain:
@@ -105,3 +76,12 @@ def unpacked_head(path: Path) -> bytes:
     with path.open("rb") as file, suppress(zstandard.ZstdError):
         return zstandard.ZstdDecompressor().stream_reader(file).read(HEAD_BYTES)
     return b""
+
+
+def unpacked_message(data: Any) -> bytes:
+    """The bytes of a message that is one zstd frame, whose size need not stand in it. Raises `zstandard.ZstdError`."""
+    reader = zstandard.ZstdDecompressor().decompressobj()
+    found = reader.decompress(data)
+    if not reader.eof:
+        raise zstandard.ZstdError("the frame is cut off")
+    return found

@@ -60,12 +60,7 @@ class Gate:
     """Carries between the links of this machine's processes and the pipes to other machines."""
 
     def __init__(
-        self,
-        inbox: Inbox,
-        fanout: Fanout,
-        pipes: Mapping[str, Pipe],
-        routes: Routes,
-        said: Callable[[str, Word], None],
+        self, inbox: Inbox, fanout: Fanout, pipes: Mapping[str, Pipe], routes: Routes, said: Callable[[str, Word], None]
     ) -> None:
         """`said` takes control messages, with the machine that each came from."""
         self.inbox, self._fanout, self._pipes, self._routes, self._said = inbox, fanout, pipes, routes, said

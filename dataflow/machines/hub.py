@@ -52,8 +52,8 @@ class HubConfig:
     routes: Mapping[str, Any]
     graph: Mapping[str, Any]
     live: bool
-    rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
-    rings_in: Sequence[Sequence[str]] = ()
+    links_out: Sequence[tuple[bool, Sequence[str]]] = ()
+    links_in: Sequence[Sequence[str]] = ()
     life: int = 1
 
 
@@ -97,11 +97,7 @@ class Hub:
     """Runs the link until it is told to leave."""
 
     def __init__(
-        self,
-        config: HubConfig,
-        channel: Channel,
-        inbox: Inbox,
-        outgoing: Sequence[tuple[Sequence[str], Outgoing]],
+        self, config: HubConfig, channel: Channel, inbox: Inbox, outgoing: Sequence[tuple[Sequence[str], Outgoing]]
     ) -> None:
         self.config, self._channel, self._inbox = config, channel, inbox
         self._fanout = Fanout(outgoing, pool_bytes=POOL_BYTES)

@@ -232,15 +232,8 @@ def access(machines: Iterable[str], namespace: str, own: str | None = None) -> d
         rules.append({"id": name, **both, "key_exprs": [f"{KEYS}/machine/{name}/**"]})
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"rules": [name, *tools, "answers", "is asked"], "subjects": [name]})
-    return {
-        "access_control": {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": rules,
-            "subjects": subjects,
-            "policies": policies,
-        }
-    }
+    named = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"access_control": {"enabled": True, "default_permission": "deny", **named}}
 
 
 def _runtime_keys(namespace: str) -> list[str]:

@@ -25,22 +25,14 @@ def unit_quaternions(message: Message, *names: str) -> None:
     """Quaternions (..., 4) have norm 1 within 1e-3. They are not renormalised: what was given is what is kept."""
     for name in names:
         data = field(message, name)
-        if data is None or not data.size:
-            continue
-        norms = np.sqrt((data * data).sum(axis=-1))
-        _refuse(
-            message,
-            name,
-            data,
-            ~(np.abs(norms - 1.0) <= QUATERNION_TOLERANCE),
-            "must be a unit quaternion (x, y, z, w)",
-        )
+        if data is not None and data.size:
+            unit_vectors(message, name, data, "must be a unit quaternion (x, y, z, w)")
 
 
-def unit_vectors(message: Message, name: str, data: npt.NDArray[Any]) -> None:
-    """Rows of `data` (..., 3) have norm 1 within 1e-3; `name` is the field they come from."""
+def unit_vectors(message: Message, name: str, data: npt.NDArray[Any], right: str = "must have unit length") -> None:
+    """Rows of `data` (..., N) have norm 1 within 1e-3; `name` is the field they come from."""
     norms = np.sqrt((data * data).sum(axis=-1))
-    _refuse(message, name, data, ~(np.abs(norms - 1.0) <= QUATERNION_TOLERANCE), "must have unit length")
+    _refuse(message, name, data, ~(np.abs(norms - 1.0) <= QUATERNION_TOLERANCE), right)
 
 
 def within(message: Message, low: float, high: float, *names: str, nan: bool = False) -> None:
@@ -125,14 +117,22 @@ def parallel(message: Message, name: str, count: int, to: str, *, empty: bool = 
 
 
 def unique(message: Message, name: str) -> None:
-    """No integer occurs twice."""
-    data = field(message, name)
-    if data is None or len(data) < 2:
-        return
-    ordered = np.sort(data)
-    twice = ordered[1:][ordered[1:] == ordered[:-1]]
-    if twice.size:
-        raise MessageError(f"{message.SCHEMA}.{name} must be unique, {twice[0]} occurs more than once")
+    """No integer, or no string, occurs twice."""
+    values = field(message, name)
+    values = values if isinstance(values, tuple) else values.tolist()
+    if len(set(values)) < len(values):
+        twice = next(value for value in sorted(values) if values.count(value) > 1)
+        raise MessageError(f"{message.SCHEMA}.{name} must be unique, {twice!r} occurs more than once")
+
+
+def class_columns(message: Message, name: str) -> None:
+    """An array (N, C) has a column for each of `class_names`, where there are any."""
+    data, names = field(message, name), field(message, "class_names")
+    if data is not None and names and data.shape[1] != len(names):
+        raise MessageError(
+            f"{message.SCHEMA}.{name} must have one column for each of the {len(names)} class_names, "
+            f"got shape {data.shape}"
+        )
 
 
 def together(message: Message, *names: str) -> None:

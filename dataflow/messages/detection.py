@@ -17,6 +17,13 @@ from dataflow.messages.checks import (
     within_length,
 )
 
+CLASS_NAMES = "name of each class, indexed by class id; empty where they have no names"
+
+
+def labels_of(class_ids: I32, class_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Class names by class ids (N,); the ids as text where classes have no names."""
+    return tuple(class_names[i] if class_names else str(i) for i in class_ids.tolist())
+
 
 class Detections2D(Message):
     """Objects found in one image."""
@@ -24,9 +31,7 @@ class Detections2D(Message):
     frame: str = scalar("str", "optical frame of the camera", default=ANCHOR)
     width: int = scalar("int", "columns of the image, pixels")
     height: int = scalar("int", "rows of the image, pixels")
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     boxes: F32 = array(
         "float32", "N 4", "(x1, y1, x2, y2), the outer edges; (0, 0) is the image's top left corner", unit="px"
     )
@@ -65,7 +70,7 @@ class Detections2D(Message):
 
     def labels(self) -> tuple[str, ...]:
         """Class name of each object, or its class id as text where classes have no names."""
-        return _labels(self.class_ids, self.class_names)
+        return labels_of(self.class_ids, self.class_names)
 
 
 class Keypoints2D(Message):
@@ -104,9 +109,7 @@ class Boxes3D(Message):
     """Objects found in space, as oriented boxes."""
 
     frame: str = scalar("str", "frame of the boxes", default=ANCHOR)
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     centers: F64 = array("float64", "N 3", "middle of each box", unit="m")
     sizes: F64 = array("float64", "N 3", "full extents along the box's own x, y and z", unit="m")
     orientations: F64 = array("float64", "N 4", "unit quaternions (x, y, z, w) that map the box's axes to `frame`")
@@ -131,7 +134,7 @@ class Boxes3D(Message):
 
     def labels(self) -> tuple[str, ...]:
         """Class name of each object, or its class id as text where classes have no names."""
-        return _labels(self.class_ids, self.class_names)
+        return labels_of(self.class_ids, self.class_names)
 
 
 def pack_masks(masks: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -149,7 +152,3 @@ def _of_image(masks: U8, width: int, height: int) -> None:
     beyond = -width % 8
     if beyond and (masks[:, :, -1] & ((1 << beyond) - 1)).any():
         raise MessageError(f"Detections2D.masks must be 0 in the {beyond} bits beyond column {width - 1}")
-
-
-def _labels(class_ids: I32, class_names: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(class_names[i] if class_names else str(i) for i in class_ids.tolist())

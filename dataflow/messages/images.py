@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from dataflow.messages.arrays import F32, U8, U16
@@ -16,14 +18,10 @@ VIDEO_FORMATS = ("h264", "h265")
 START_CODES = (b"\0\0\1", b"\0\0\0\1")
 
 
-class Image(Message):
-    """A colour or grey image, as the camera's optical frame sees it; stamped at the middle of its exposure."""
+class _Raster:
+    """The size of `data`."""
 
-    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
-    data: U8 = array("uint8", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
-
-    def validate(self) -> None:
-        not_empty(self, "data")
+    data: Any
 
     @property
     def height(self) -> int:
@@ -34,6 +32,16 @@ class Image(Message):
     def width(self) -> int:
         """Columns."""
         return int(self.data.shape[1])
+
+
+class Image(_Raster, Message):
+    """A colour or grey image, as the camera's optical frame sees it; stamped at the middle of its exposure."""
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
+    data: U8 = array("uint8", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
+
+    def validate(self) -> None:
+        not_empty(self, "data")
 
     @property
     def is_color(self) -> bool:
@@ -44,7 +52,7 @@ class Image(Message):
         return pictures.of_pixels(self.data)
 
 
-class Image16(Message):
+class Image16(_Raster, Message):
     """A colour or grey image of 16 bits a channel, of thermal and scientific cameras; values in the camera's own
     scale."""
 
@@ -53,16 +61,6 @@ class Image16(Message):
 
     def validate(self) -> None:
         not_empty(self, "data")
-
-    @property
-    def height(self) -> int:
-        """Rows."""
-        return int(self.data.shape[0])
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return int(self.data.shape[1])
 
     def _picture(self) -> Picture | None:
         return pictures.of_pixels((self.data >> 8).astype(np.uint8))
@@ -108,7 +106,7 @@ class CompressedVideo(Message):
             )
 
 
-class DepthImage(Message):
+class DepthImage(_Raster, Message):
     """Distance along the optical axis (z, not range) per pixel."""
 
     frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)", default=ANCHOR)
@@ -117,21 +115,11 @@ class DepthImage(Message):
     def validate(self) -> None:
         not_empty(self, "data")
 
-    @property
-    def height(self) -> int:
-        """Rows."""
-        return int(self.data.shape[0])
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return int(self.data.shape[1])
-
     def _picture(self) -> Picture | None:
         return pictures.of_depth(self.data)
 
 
-class RelativeDepth(Message):
+class RelativeDepth(_Raster, Message):
     """Nearness per pixel: inverse depth up to an unknown factor and constant, as estimated from one image."""
 
     frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)", default=ANCHOR)
@@ -144,16 +132,6 @@ class RelativeDepth(Message):
 
     def validate(self) -> None:
         not_empty(self, "data")
-
-    @property
-    def height(self) -> int:
-        """Rows."""
-        return int(self.data.shape[0])
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return int(self.data.shape[1])
 
     def _picture(self) -> Picture | None:
         return pictures.of_nearness(self.data)

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
 from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
-from dataflow.messages.checks import (
-    positive,
-    together,
-    unique,
-    unit_quaternions,
-    unit_vectors,
-    within,
-    within_length,
-)
+from dataflow.messages.checks import positive, together, unique, unit_quaternions, unit_vectors, within, within_length
 from dataflow.messages.display import pictures
 from dataflow.messages.display.pictures import Picture
 from dataflow.messages.geometry import transform_matrix

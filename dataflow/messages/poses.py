@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from dataflow.messages.arrays import F64, I64
 from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
-from dataflow.messages.checks import finite, parallel, unit_quaternions, within
+from dataflow.messages.checks import finite, parallel, unique, unit_quaternions, unit_vectors, within
 from dataflow.messages.fields.declared import MISSING
 from dataflow.messages.geometry import split_matrix, transform_matrix
 
@@ -82,9 +82,7 @@ class Transforms(Message):
         parallel(self, "frames", count, "translations")
         parallel(self, "child_frames", count, "translations")
         unit_quaternions(self, "rotations")
-        if len(set(self.child_frames)) != count:
-            twice = next(c for c in self.child_frames if self.child_frames.count(c) > 1)
-            raise MessageError(f"Transforms.child_frames must be unique, {twice!r} occurs more than once")
+        unique(self, "child_frames")
         for frame, child in zip(self.frames, self.child_frames, strict=True):
             if frame == child:
                 raise MessageError(f"Transforms.child_frames: {child!r} must differ from its parent frame")
@@ -256,15 +254,8 @@ class ParticleSet(Message):
     def validate(self) -> None:
         finite(self, "weights")
         within(self, 0.0, np.inf, "weights")
-        if self.poses.shape[1] == 7 and len(self.poses):
-            norms = np.sqrt((self.poses[:, 3:] ** 2).sum(axis=1))
-            wrong = np.flatnonzero(~(np.abs(norms - 1) <= 1e-3))
-            if wrong.size:
-                i = int(wrong[0])
-                raise MessageError(
-                    f"ParticleSet.poses[{i}] must end in a unit quaternion (x, y, z, w), "
-                    f"got {self.poses[i, 3:].tolist()}"
-                )
+        if self.poses.shape[1] == 7:
+            unit_vectors(self, "poses", self.poses[:, 3:], "must end in a unit quaternion (x, y, z, w)")
 
     @property
     def count(self) -> int:

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from dataflow.messages.arrays import F32, F64, I32, I64
-from dataflow.messages.base import Message, MessageError, array, scalar
-from dataflow.messages.checks import parallel, table_indices, together, unique, unit_quaternions, within, within_length
+from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.checks import (
+    class_columns,
+    parallel,
+    table_indices,
+    together,
+    unique,
+    unit_quaternions,
+    within,
+    within_length,
+)
+from dataflow.messages.detection import CLASS_NAMES, labels_of
 
 
 class SceneGraph(Message):
     """Objects (nodes) and their relations (edges: subject, predicate, object)."""
 
     frame: str = scalar("str", "frame of the positions")
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     labels: tuple[str, ...] = scalar("strs", "name of each node, or empty where nodes have no names", default=())
     predicates: tuple[str, ...] = scalar("strs", "predicate of each relation, such as `on` or `next to`", default=())
     ids: I64 = array("int64", "N", "identity of each node over time, unique")
@@ -77,7 +85,7 @@ class SceneGraph(Message):
         """Returns what to call each node: its label, else its class name and id."""
         if self.labels:
             return self.labels
-        words = [self.class_names[c] if self.class_names else str(c) for c in self.class_ids.tolist()]
+        words = labels_of(self.class_ids, self.class_names)
         return tuple(f"{word} {i}" for word, i in zip(words, self.ids.tolist(), strict=True))
 
     def tracks_of(self, node: int) -> tuple[int, ...]:
@@ -109,11 +117,7 @@ class Activity(Message):
         parallel(self, "goals", len(self.subjects), "subjects", empty=True)
         table_indices(self, "class_ids", "class_names")
         within(self, 0.0, 1.0, "scores", "probabilities")
-        if self.probabilities is not None and self.class_names and self.probabilities.shape[1] != len(self.class_names):
-            raise MessageError(
-                f"Activity.probabilities must have one column for each of the {len(self.class_names)} class_names, "
-                f"got shape {self.probabilities.shape}"
-            )
+        class_columns(self, "probabilities")
 
     @property
     def count(self) -> int:
@@ -125,9 +129,7 @@ class Classification(Message):
     """Classes of whole images (N = 1) or of the objects found in them."""
 
     frame: str = scalar("str", "frame of the sensor; empty where none applies", default="")
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     class_ids: I32 = array("int32", "N", "the likeliest class, an index into `class_names`")
     scores: F32 = array("float32", "N", "its probability, [0, 1]")
     probabilities: F32 | None = array("float32", "N C", "probability of every class, [0, 1]", default=None)
@@ -136,15 +138,11 @@ class Classification(Message):
     def validate(self) -> None:
         table_indices(self, "class_ids", "class_names")
         within(self, 0.0, 1.0, "scores", "probabilities")
-        if self.probabilities is not None and self.class_names and self.probabilities.shape[1] != len(self.class_names):
-            raise MessageError(
-                f"Classification.probabilities must have one column for each of the {len(self.class_names)} "
-                f"class_names, got shape {self.probabilities.shape}"
-            )
+        class_columns(self, "probabilities")
 
     def labels(self) -> tuple[str, ...]:
         """The name of each row's class (its number where classes have no names)."""
-        return tuple(self.class_names[c] if self.class_names else str(c) for c in self.class_ids.tolist())
+        return labels_of(self.class_ids, self.class_names)
 
 
 class FeatureVector(Message):

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dataflow.messages.detection import labels_of
 from dataflow.messages.scene import Activity, SceneGraph
 
 ACTING = frozenset(("sitting_on", "holding", "facing", "approaching", "reaching_for", "heads_for"))
@@ -77,7 +78,7 @@ class SceneSummary:
 
 def class_names(graph: SceneGraph) -> tuple[str, ...]:
     """The class name of each node; its number where classes have no names."""
-    return tuple(graph.class_names[c] if graph.class_names else str(c) for c in graph.class_ids.tolist())
+    return labels_of(graph.class_ids, graph.class_names)
 
 
 def summarize(graph: SceneGraph, activities: Activity | None = None, most: int = 24) -> SceneSummary:

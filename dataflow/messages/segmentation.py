@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataflow.messages.arrays import F32, I32, U8, U16
 from dataflow.messages.base import ANCHOR, Message, MessageError, array, scalar
 from dataflow.messages.checks import not_empty, within
+from dataflow.messages.detection import CLASS_NAMES
 from dataflow.messages.display import pictures
 from dataflow.messages.display.pictures import Picture
 
@@ -13,9 +14,7 @@ class SegmentationMap(Message):
     """Class of every pixel of an image (semantic), and its instance where known (panoptic)."""
 
     frame: str = scalar("str", "optical frame of the camera", default=ANCHOR)
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     void: int | None = scalar("int", "class id of pixels without a class (255 in many data sets)", default=None)
     classes: U8 | U16 = array("uint8|uint16", "H W", "class id of each pixel, an index into `class_names` or `void`")
     instances: U16 | I32 | None = array(

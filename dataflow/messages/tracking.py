@@ -16,6 +16,7 @@ from dataflow.messages.checks import (
     within,
     within_length,
 )
+from dataflow.messages.detection import CLASS_NAMES, labels_of
 
 
 class TrackState(IntEnum):
@@ -41,9 +42,7 @@ class Tracks(Message):
     )
     width: int | None = scalar("int", "columns of the image that `boxes` lie in, pixels", default=None)
     height: int | None = scalar("int", "rows of the image that `boxes` lie in, pixels", default=None)
-    class_names: tuple[str, ...] = scalar(
-        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
-    )
+    class_names: tuple[str, ...] = scalar("strs", CLASS_NAMES, default=())
     ids: I64 = array("int64", "N", "identity of each track, unique, never used again")
     states: U8 = array("uint8", "N", "`TrackState`: 0 tentative, 1 confirmed, 2 coasting, 3 ended")
     scores: F32 = array("float32", "N", "confidence, [0, 1]")
@@ -95,7 +94,7 @@ class Tracks(Message):
 
     def labels(self) -> tuple[str, ...]:
         """Class name of each track, or its class id as text where classes have no names."""
-        return tuple(self.class_names[i] if self.class_names else str(i) for i in self.class_ids.tolist())
+        return labels_of(self.class_ids, self.class_names)
 
 
 class LandmarkSightings(Message):

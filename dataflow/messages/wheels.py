@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataflow.messages.arrays import F64, I64
-from dataflow.messages.base import Message, MessageError, array, scalar
-from dataflow.messages.checks import parallel
+from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.checks import parallel, unique
 
 
 class WheelTicks(Message):
@@ -21,7 +21,7 @@ class WheelTicks(Message):
 
     def validate(self) -> None:
         parallel(self, "names", len(self.ticks), "ticks")
-        _unique_names(self, self.names)
+        unique(self, "names")
 
 
 class JointState(Message):
@@ -35,14 +35,8 @@ class JointState(Message):
     efforts: F64 | None = array("float64", "N", "torque, or force of a prismatic joint", unit="N·m or N", default=None)
 
     def validate(self) -> None:
-        _unique_names(self, self.names)
+        unique(self, "names")
         for name in ("positions", "velocities", "efforts"):
             values = self.__dict__[name]
             if values is not None:
                 parallel(self, "names", len(values), name)
-
-
-def _unique_names(message: Message, names: tuple[str, ...]) -> None:
-    if len(set(names)) != len(names):
-        twice = next(n for n in names if names.count(n) > 1)
-        raise MessageError(f"{message.SCHEMA}.names must be unique, {twice!r} occurs more than once")

@@ -8,8 +8,7 @@ from typing import Any
 
 from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.failure import OperatorFailure
-from dataflow.execution.feeds.log import LogFeed
-from dataflow.execution.feeds.numbering import gapless
+from dataflow.execution.feeds.log import LogFeed, gapless
 from dataflow.execution.feeds.playable import PlayableStreams
 from dataflow.execution.live import LiveRunner
 from dataflow.execution.ports import Emitter
@@ -42,11 +41,8 @@ def build(
     event_clock: Callable[[], int] | None = None,
     on_failure: Outlived = _cannot_restart,
 ) -> None:
-    """Makes the operators that `config` names, and the recording that is replayed, if any.
-
-    Sources go among the feeds of the driver, those of a live run to `live`. Raises `OperatorFailure` for an operator
-    that cannot be made.
-    """
+    """Makes the operators that `config` names, and the recording that is replayed, if any. Sources go among the feeds
+    of the driver, those of a live run to `live`. Raises `OperatorFailure` for an operator that cannot be made."""
     for name in config.nodes:
         node = graph.nodes[name]
         try:
@@ -107,15 +103,16 @@ def _make_runner(
 def _log(graph: Graph, replay: dict[str, Any], emitter: Emitter) -> LogFeed:
     """Opens the recording that stands in for sources."""
     makers = {stream: graph.streams[stream].node for stream in replay["streams"]}
+    recording, start, end = _played(Path(replay["path"]), replay["bag"]), replay["start"], replay["end"]
     return LogFeed(
-        _played(Path(replay["path"]), replay["bag"]),
+        recording,
         makers,
         emitter,
         ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
         finals=replay["finals"],
-        start=replay["start"],
-        end=replay["end"],
-        numbered=gapless,
+        start=start,
+        end=end,
+        messages=gapless(recording.messages(list(makers), start, end)),
     )
 
 

@@ -11,12 +11,10 @@ import socket
 import struct
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import msgpack
-
-from dataflow.process.polling import readable
 
 LONGEST = 1 << 30
 """Bytes of one message, at most."""
@@ -92,11 +90,6 @@ class Channel:
         return self._socket.fileno()
 
 
-def ready(channels: Iterable[Channel], timeout: float) -> list[Channel]:
-    """Returns those channels from which `receive` has something to read, after at most `timeout` seconds."""
-    return readable(channels, timeout)
-
-
 def _pair() -> tuple[socket.socket, int]:
     """Returns one end, and the descriptor of the other, which a child process inherits."""
     ours, theirs = socket.socketpair()
@@ -143,10 +136,8 @@ class QueuedChannel:
             self._replaceable[kind] = entry
 
     def flush(self) -> bool:
-        """Sends what the process takes at the moment; True when it took anything or nothing was queued.
-
-        Raises `ChannelClosed` when the process is gone.
-        """
+        """Sends what the process takes at the moment; True when it took anything or nothing was queued. Raises
+        `ChannelClosed` when the process is gone."""
         took = not self._queue
         while self._queue:
             entry = self._queue[0]

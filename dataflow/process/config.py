@@ -31,7 +31,7 @@ class ProcessConfig:
     `firings`: whether a recorder takes the firing records. `live`: sources do
     not wait for the graph, and operators not for their inputs. `resume` is given to a process that takes the place of
     one that died: for each operator, where it had got to (`Resumed`, as plain values). `warm`: the recording and the
-    stamp from which on it is replayed, with the operators' states of that moment. `rings_out` and `rings_in`: for each
+    stamp from which on it is replayed, with the operators' states of that moment. `links_out` and `links_in`: for each
     link to and from another process the keys of its channels, after whether messages may be dropped for a consumer that
     takes nothing; their descriptors were handed down in this order. `life`: how many processes have had its place, with
     this one.
@@ -53,8 +53,8 @@ class ProcessConfig:
     live: bool = False
     resume: dict[str, Any] | None = None
     warm: dict[str, Any] | None = None
-    rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
-    rings_in: Sequence[Sequence[str]] = ()
+    links_out: Sequence[tuple[bool, Sequence[str]]] = ()
+    links_in: Sequence[Sequence[str]] = ()
     life: int = 1
 
     def resumed(self, operator: str) -> Resumed:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from dataflow.chaos.faults import OperatorFaults
 from dataflow.execution.driver import Driver
 from dataflow.execution.feeds.window import Window
+from dataflow.execution.protocol import Runner
+from dataflow.operator import ParameterError
 from dataflow.process.channel import ChannelClosed
 from dataflow.process.live_sources import LiveSources
-from dataflow.process.planned_faults import do_fault
 from dataflow.process.requests import Requests
 from dataflow.process.streams.inlet import Inlet
 from dataflow.process.streams.outlet import Outlet
 from dataflow.sync import FOREVER
+
+MALFORMED = b"\x00malformed\xff" * 8
 
 
 class Control:
@@ -64,15 +70,7 @@ class Control:
                     for runner in self._driver.taking(stream):
                         runner.end(stream, None, fields["reason"])
             case "fault":
-                kind, operator = fields["fault"], fields["operator"]
-                do_fault(
-                    kind,
-                    operator,
-                    fields["fields"],
-                    driver=self._driver,
-                    live=self._live,
-                    outlet=self._outlet,
-                )
+                self._begin_fault(fields["fault"], fields["operator"], fields["fields"])
             case "grow":
                 self._window.grow()
             case "poll":
@@ -99,3 +97,22 @@ class Control:
                 (consumer.absent.add if absent else consumer.absent.discard)(stream)
         if not absent:
             self._inlet.restarted(streams)
+
+    def _begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> None:
+        """Does one planned fault now, or lets it begin. What each kind means: docs/faults.md."""
+        print(f"planned fault: {kind} {operator} {dict(fields)}", file=sys.stderr)
+        if self._live.begin_fault(kind, operator, fields):
+            return
+        maker = self._driver[operator]
+        match kind:
+            case "param":
+                try:
+                    maker.set_parameter(fields["name"], fields["value"])
+                except ParameterError as error:
+                    print(f"planned fault: {error}", file=sys.stderr)
+            case "malformed":
+                for stream in maker.node.outputs.values():
+                    self._outlet.put_raw(stream, MALFORMED)
+            case "raise" | "hang" | "slow" | "leak" if isinstance(maker, Runner):
+                maker.faults = maker.faults or OperatorFaults()
+                maker.faults.begin(kind, fields, time.monotonic())

@@ -26,17 +26,17 @@ def take_descriptors(descriptors: Sequence[int], config: Mapping[str, Any]) -> D
     """Opens what was handed down.
 
     The order: this process's eventfd; ring, eventfd of the other process and board of each link of the configuration's
-    `rings_out`, then of its `rings_in`; last, for an operator process of a live run, the memory for its firing records.
+    `links_out`, then of its `links_in`; last, for an operator process of a live run, the memory for its firing records.
     """
     rest = iter(descriptors)
     wake = next(rest)
     window, factors = config.get("window", (256, 64 << 20)), BACKLOG
     bound = window[0] * factors[0], window[1] * factors[1]
     outgoing = [
-        (keys, Outgoing(*_three(rest), bound if lossy else None)) for lossy, keys in config.get("rings_out", ())
+        (keys, Outgoing(*_three(rest), bound if lossy else None)) for lossy, keys in config.get("links_out", ())
     ]
     pools = PoolReader()
-    incoming = [Incoming(*_three(rest), keys, pools, config.get("life", 1)) for keys in config["rings_in"]]
+    incoming = [Incoming(*_three(rest), keys, pools, config.get("life", 1)) for keys in config["links_in"]]
     return Descriptors(wake, outgoing, incoming, next(rest, None))
 
 

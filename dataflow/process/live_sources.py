@@ -22,8 +22,7 @@ from dataflow.execution.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
 from dataflow.process.awake import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
-from dataflow.process.log_pipe import SOURCE_THREAD
-from dataflow.process.outlived import tell_outlived
+from dataflow.process.log_pipe import SOURCE_THREAD, tell_outlived
 from dataflow.process.streams.inbox import Inbox
 
 MISSED_AFTER = 0.2

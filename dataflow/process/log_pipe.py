@@ -17,6 +17,7 @@ from typing import Any, Final, TextIO
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.process.channel import Channel
 from dataflow.recording.streams.logs import LogLine
 
 MARK: Final = "\x1e"
@@ -165,3 +166,18 @@ class _Lines(io.TextIOBase):
             rest, self._rest = self._rest, ""
             if rest:
                 _say(self._descriptor, self._level, rest, self._source)
+
+
+def tell_outlived(channel: Channel, failure: OperatorFailure, pause: float) -> None:
+    """Logs the traceback of a failure, and reports to the supervisor that the operator is made anew in `pause` s.
+    Raises `ChannelClosed`."""
+    log_failure(failure)
+    channel.send(
+        "restarting",
+        operator=failure.operator,
+        when=failure.when,
+        summary=failure.summary,
+        where=failure.where,
+        traceback=failure.traceback,
+        pause=pause,
+    )

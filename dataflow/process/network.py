@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Callable, Iterable
 
 from dataflow.graph.sections import Network
 from dataflow.transport import BusError, NetworkConfig
@@ -14,12 +13,6 @@ BLOCKED, BLOCKED_LIVE = 30.0, 2.0
 """Seconds that a publication waits for a subscriber that takes nothing. A live run loses messages rather than time."""
 LEAVE_WITHIN = 4.5
 """Seconds for taking leave of whom is connected from outside: less than any run gives its processes to close."""
-
-
-class Closable(Protocol):
-    """A part of a process's place in the network."""
-
-    def close(self) -> None: ...
 
 
 def network_config(network: Network, listen: Iterable[str], *, live: bool) -> NetworkConfig:
@@ -38,15 +31,13 @@ def network_config(network: Network, listen: Iterable[str], *, live: bool) -> Ne
     )
 
 
-def leave_network(process: str, *parts: Closable) -> None:
+def leave_network(process: str, *closes: Callable[[], None]) -> None:
     """Closes parts of a process's place in the network in turn, and prints a warning if `LEAVE_WITHIN` is too short.
-
-    All work is done by then: a neighbour that hangs must not fail the run.
-    """
+    All work is done by then: a neighbour that hangs must not fail the run."""
 
     def leave() -> None:
-        for part in parts:
-            part.close()
+        for close in closes:
+            close()
 
     try:
         late = "" if within(LEAVE_WITHIN, leave, "leave") else f"not done within {LEAVE_WITHIN:g} s"

@@ -27,11 +27,10 @@ from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.control import Control
 from dataflow.process.descriptors import BACKLOG
-from dataflow.process.idle_report import IdleReport
 from dataflow.process.live_sources import LiveSources, Step
+from dataflow.process.log_pipe import tell_outlived
 from dataflow.process.network import leave_network, network_config
-from dataflow.process.outlived import tell_outlived
-from dataflow.process.progress import Progress
+from dataflow.process.progress import Progress, final_report
 from dataflow.process.requests import Requests
 from dataflow.process.streams.inbox import Inbox
 from dataflow.process.streams.inlet import Inlet
@@ -56,12 +55,7 @@ class OperatorProcess:
     """Runs its operators until they end, it is told to leave, or something fails."""
 
     def __init__(
-        self,
-        config: ProcessConfig,
-        channel: Channel,
-        inbox: Inbox,
-        outgoing: Links = (),
-        box: int | None = None,
+        self, config: ProcessConfig, channel: Channel, inbox: Inbox, outgoing: Links = (), box: int | None = None
     ) -> None:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
         self.config, self.channel, self.inbox = config, channel, inbox
@@ -97,17 +91,7 @@ class OperatorProcess:
         )
         windows = self.window, self.backlog
         self.orders = Control(windows, self.driver, self.live, self.inlet, self.outlet, self.requests, self.release)
-        self._standing = IdleReport(
-            channel,
-            self.orders,
-            self.driver,
-            self.live,
-            inbox,
-            self.inlet,
-            self.outlet,
-            self.progress,
-            lambda: self.bus.counters(),  # it is opened later
-        )
+        self._ended = False
         self._take_within = math.inf if config.live else TAKE_WITHIN
         self._watch: Watchdog | None = None
         self._running = False
@@ -217,7 +201,7 @@ class OperatorProcess:
         self.outlet.flush_due()
         self.progress.report(idle=self.inbox.empty())
         if self.orders.asked is not None:
-            self._standing.answer(idle=not worked)  # after the work that was there
+            self._answer(idle=not worked)  # after the work that was there
         return True
 
     def _in_place_of_main(self, act: Callable[[Step], None], step: Step) -> bool:
@@ -246,7 +230,7 @@ class OperatorProcess:
             self._watch.stop()
         reading, failures = self.live.await_readers()
         failures += self.driver.close(but=reading)
-        leave_network(self.config.label, self.taps, self.outside, self.bus)
+        leave_network(self.config.label, self.taps.close, self.outside.close, self.bus.close)
         self.outlet.close()
         if failures:
             raise failures[0]
@@ -322,10 +306,8 @@ class OperatorProcess:
     # Work
 
     def _work(self) -> bool:
-        """Does what there is to do, but not for long where something has arrived. True when anything was done.
-
-        Nothing before all processes are linked: a restarted one is sent messages before it is told what time it is.
-        """
+        """Does what there is to do, but not for long where something has arrived. True when anything was done. Nothing
+        before all processes are linked: a restarted one is sent messages before it is told what time it is."""
         if not self.orders.released:
             return False
         worked = False
@@ -336,8 +318,51 @@ class OperatorProcess:
             if not (feeds or woken) or not inbox.empty():
                 break
             self.progress.report(idle=False)
-        self._standing.end_if_done()
+        self._end_if_done()
         return worked
+
+    # Reports
+
+    def _end_if_done(self) -> None:
+        """Sends what came of everything, once, when all feeds, sources and operators have ended."""
+        for runner in self.driver.operators:
+            if not runner.ended:
+                return
+        if self._ended or not (self.driver.feeding.ended and self.live.ended):
+            return
+        self._ended = True
+        self.outlet.flush_all()
+        self.progress.report(idle=True)
+        refused = {"malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
+        moved = self.outlet.counters() | self.inbox.counters() | self.bus.counters() | refused
+        self.channel.send("ended", report=final_report(self.driver, moved))
+
+    def _answer(self, *, idle: bool) -> None:
+        """Answers the supervisor's poll. `idle`: a look at everything has just found nothing to do. Envelopes and
+        progress leave first: others may go on by them, and the answer is taken for a proof."""
+        asked, self.orders.asked = self.orders.asked, None
+        self.outlet.flush_all()
+        self.progress.report(idle=idle, at_once=True)
+        feeding = self.driver.feeding
+        self.channel.send(
+            "state",
+            round=asked,
+            idle=idle and self.inbox.empty() and not self._waits_for_clock() and self.live.ended,
+            sent=self.outlet.sent,
+            received=self.inlet.received,
+            full=feeding.full,
+            waiting=self.progress.waiting(),
+            due=feeding.next_due(),
+            **({"paused": feeding.playback.paused} if feeding.feeds else {}),
+        )
+
+    def _waits_for_clock(self) -> bool:
+        feeding = self.driver.feeding
+        return (
+            (feeding.playback.holds and not feeding.ended)
+            or (self.orders.released and feeding.next_due() is not None)
+            or any(runner.next_due() is not None for runner in self.driver.operators)
+        )
 
     def _arrived(self) -> bool:
         return not self.inbox.empty()

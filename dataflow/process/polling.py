@@ -16,10 +16,8 @@ Waited = TypeVar("Waited", bound=int | HasDescriptor)
 
 
 def received(connection: socket.socket, nbytes: int, descriptors: int) -> tuple[bytes, list[int]]:
-    """Returns what is read from a Unix socket, and the descriptors with it; nothing where the other end is gone.
-
-    One that closes it, or is killed, with unread data in it resets it. Raises `OSError`.
-    """
+    """Returns what is read from a Unix socket, and the descriptors with it; nothing where the other end is gone. One
+    that closes it, or is killed, with unread data in it resets it. Raises `OSError`."""
     try:
         data, given, _, _ = socket.recv_fds(connection, nbytes, descriptors)
     except ConnectionResetError:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -13,8 +14,7 @@ from dataflow.execution.driver import Driver, Maker
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.code import ReloadError, code_now, file_digests
-from dataflow.messages.base import MessageError
-from dataflow.operator import ParameterError, is_tunable
+from dataflow.operator import is_tunable
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.live_sources import LiveSources
@@ -24,7 +24,6 @@ from dataflow.process.streams.recent import RecentFirings
 from dataflow.remote import Remote
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode
-from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import local_key, runtime_key
 
 LIVE = "it is a live run: devices and the clock do not wait; runs without --live, and replays, can be paused"
@@ -77,35 +76,26 @@ class Requests:
         `{"reload": true}`, from `here` alone, the operator goes on with its code as it is in its files now
         (`Runner.reload`); with `"files": true` besides, these are only looked at (`file_digests`).
         """
-        with query:
-            try:
-                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
-                if asked.get("reload") and not here:
-                    raise ValueError("only a tool of this machine can have code loaded again")
-                value = self._value_asked(self._driver[name], asked)
-                answer = {"ok": True, "operator": name, "value": value}
-            except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
-                answer = {"ok": False, "operator": name, "error": str(error)}
-            query.reply(query.key_expr, msgpack.packb(answer))
+        with _answering(query, operator=name) as answer:
+            asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+            if asked.get("reload") and not here:
+                raise ValueError("only a tool of this machine can have code loaded again")
+            answer["value"] = self._value_asked(self._driver[name], asked)
 
     def answer_playback(self, query: Any) -> None:
         """Answers a request to pause, resume, step, or change the speed of what this process reads; one without an
         action asks how it stands."""
-        with query:
+        with _answering(query) as answer:
             feeding = self._feeding
-            try:
-                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
-                if not feeding.feeds:
-                    raise ValueError(LIVE)
-                if "action" in asked:
-                    speed = asked.get("speed")
-                    self.play(asked["action"], int(asked.get("steps", 1)), None if speed is None else float(speed))
-                playback = feeding.playback
-                answer: dict[str, Any] = {"ok": True, "paused": playback.paused, "ended": feeding.ended}
-                answer |= {"speed": playback.speed, "stamp": feeding.last, "replay": self._replayed()}
-            except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
-                answer = {"ok": False, "error": str(error)}
-            query.reply(query.key_expr, msgpack.packb(answer))
+            asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
+            if not feeding.feeds:
+                raise ValueError(LIVE)
+            if "action" in asked:
+                speed = asked.get("speed")
+                self.play(asked["action"], int(asked.get("steps", 1)), None if speed is None else float(speed))
+            playback = feeding.playback
+            answer |= {"paused": playback.paused, "ended": feeding.ended, "speed": playback.speed}
+            answer |= {"stamp": feeding.last, "replay": self._replayed()}
 
     def _replayed(self) -> dict[str, Any] | None:
         """Returns from when to when a recording is played, and the stamp that `--start` counts from."""
@@ -120,20 +110,12 @@ class Requests:
         A message with the stamp 0 is given the event time of now. A request without payload is answered with the port
         and the type that the source takes.
         """
-        with query:
-            source = maker.source
-            assert isinstance(source, Remote)
-            port = source.port
-            answer: dict[str, Any] = {
-                "operator": maker.node.name, "port": port.name, "types": [type_.SCHEMA for type_ in port.types],
-            }  # fmt: skip
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            if payload:
-                try:
-                    answer |= {"ok": True, "stamp": self._publish(maker, source, payload)}
-                except (DecodeError, MessageError, ValueError) as error:
-                    answer |= {"ok": False, "error": str(error)}
-            query.reply(query.key_expr, msgpack.packb(answer))
+        source = maker.source
+        assert isinstance(source, Remote)
+        types = [type_.SCHEMA for type_ in source.port.types]
+        with _answering(query, operator=maker.node.name, port=source.port.name, types=types) as answer:
+            if payload := b"" if query.payload is None else query.payload.to_bytes():
+                answer["stamp"] = self._publish(maker, source, payload)
 
     def _publish(self, maker: SourceRunner, source: Remote, payload: bytes) -> int:
         """Hands a message to its source; returns its stamp. Raises `DecodeError`, `ValueError`."""
@@ -194,20 +176,27 @@ class Requests:
 
     def _answer_trigger(self, query: Any) -> None:
         """Forwards a request to keep the history; on Zenoh's thread, so an operator at work delays nothing."""
-        with query:
-            try:
-                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
-                self._channel.send("trigger", id=str(asked["id"]), text=str(asked["text"]))
-                answer: dict[str, Any] = {"ok": True}
-            except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
-                answer = {"ok": False, "error": str(error)}
-            query.reply(query.key_expr, msgpack.packb(answer))
+        with _answering(query):
+            asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+            self._channel.send("trigger", id=str(asked["id"]), text=str(asked["text"]))
 
     def _restarts(self) -> dict[str, int]:
         """Returns how often each operator was restarted, by this process and in the processes before it."""
         here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._driver.sources}
         here |= {runner.node.name: runner.restarted for runner in self._driver.operators}
         return {name: self._config.resumed(name).restarts + times for name, times in here.items()}
+
+
+@contextmanager
+def _answering(query: Any, **about: Any) -> Iterator[dict[str, Any]]:
+    """Replies with what the block puts into the answer, or with why that failed; either way with what it is about."""
+    answer: dict[str, Any] = {**about, "ok": True}
+    with query:
+        try:
+            yield answer
+        except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
+            answer = {**about, "ok": False, "error": str(error)}
+        query.reply(query.key_expr, msgpack.packb(answer))
 
 
 def _asked(query: Any) -> dict[str, Any]:

@@ -107,9 +107,7 @@ def fork(
     call: Callable[[], int], handed: Iterable[int], variables: Mapping[str, str], output: tuple[int, int] | None
 ) -> int:
     """Forks a process that makes a call as if it were started with these descriptors and variables; returns its id.
-
-    `output`: the descriptors to which its standard output and its errors go.
-    """
+    `output`: the descriptors to which its standard output and its errors go."""
     sys.stdout.flush()
     sys.stderr.flush()
     pid = os.fork()

@@ -87,9 +87,6 @@ def part_path(path: Path, number: int) -> Path:
 def parts_of(path: Path) -> list[Path]:
     """Returns the parts of `path` that there are, in order; the file of that very name is none."""
     numbered = re.compile(re.escape(path.stem) + r"_(\d{3,})" + re.escape(path.suffix))
-    found = [(int(match[1]), file) for file in _files(path.parent) if (match := numbered.fullmatch(file.name))]
+    files = path.parent.iterdir() if path.parent.is_dir() else ()
+    found = [(int(match[1]), file) for file in files if (match := numbered.fullmatch(file.name))]
     return [file for _, file in sorted(found)]
-
-
-def _files(folder: Path) -> list[Path]:
-    return list(folder.iterdir()) if folder.is_dir() else []

@@ -9,15 +9,7 @@ from typing import Any
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
 
-_UNITS = {
-    "m": "m",
-    "s": "s",
-    "ms": "ms",
-    "deg": "°",
-    "rad": "rad",
-    "hz": "Hz",
-    "percent": "%",
-}
+_UNITS = {"m": "m", "s": "s", "ms": "ms", "deg": "°", "rad": "rad", "hz": "Hz", "percent": "%"}
 
 
 def figure(name: str, value: Any) -> tuple[str, str, str]:

@@ -23,7 +23,7 @@ from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.records.repetition import Repetition, look_at
 from dataflow.reexecution.in_turn import RunnerInTurn, Turns
-from dataflow.reexecution.needed import NeededStreams, first_needed
+from dataflow.reexecution.needed import first_needed, needed_messages
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
 
@@ -113,12 +113,11 @@ class Recomputation:
         in_turn: Collection[str] = (),
     ) -> None:
         self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
-        ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
-        records = {n: partial(_until, partial(log.ordered, graph.nodes[n]), ends[n]) for n in feeding.operators}
+        nodes = [graph.nodes[name] for name in feeding.operators]
+        records = {n.name: partial(_until, partial(log.ordered, n), slices.get(n.name, (None, end))[1]) for n in nodes}
         outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)
         begins = {} if begin is None else _begins(graph, records, frozenset(feeding.streams), begin)
         begins |= {name: first for name, (first, _) in slices.items() if first is not None}
-        nodes = [graph.nodes[name] for name in feeding.operators]
         repeated = _repetitions(nodes, records, begins)
         taken = {stream for node in nodes for stream in node.taken}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
@@ -143,12 +142,13 @@ class Recomputation:
         makers = {stream: graph.streams[stream].node for stream in sorted({*feeding.streams, *feeding.besides})}
         starts = None if begin is None else first_needed(log, graph, self.runners.values())
         self._feed = LogFeed(
-            recording if starts is None or begin is None else NeededStreams(recording, starts, begin),
+            recording,
             makers,
             _HandOver(self._driver, frozenset(feeding.besides), read, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
             finals=final_stamps(recording, makers),
             end=end,
+            messages=None if starts is None else needed_messages(recording, makers, starts, begin, end),
         )
         self._driver.feeding.feeds.append(self._feed)
         self._threads = graph.threads
@@ -156,10 +156,8 @@ class Recomputation:
         """Seconds that `run` took from when all operators were set up."""
 
     def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
-        """Makes the recorded firings, to the end or until `until()`, asked now and then; then closes.
-
-        Raises `OperatorFailure`, `RecordingError`, `Stuck`.
-        """
+        """Makes the recorded firings, to the end or until `until()`, asked now and then; then closes. Raises
+        `OperatorFailure`, `RecordingError`, `Stuck`."""
         try:
             self.begin()
             began = time.monotonic()

@@ -36,10 +36,8 @@ class NotRecorded(ReplayError):
 
 
 def recorded_graph(recording: PlayableStreams) -> Graph:
-    """Returns the graph that made a recording, without its network: a recording opens no port and no connection.
-
-    Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
-    """
+    """Returns the graph that made a recording, without its network: a recording opens no port and no connection. Its
+    operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`."""
     return isolated(graph_as_recorded(recording))
 
 
@@ -121,10 +119,8 @@ def graph_as_recorded(recording: PlayableStreams) -> Graph:
 
 
 def resolved_graph(recording: PlayableStreams) -> Graph | None:
-    """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator.
-
-    None where the recording holds none, or none that is sound (another version's, or another program's).
-    """
+    """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator. None
+    where the recording holds none, or none that is sound (another version's, or another program's)."""
     held = recording.metadata.get(GRAPH, {})
     try:
         graph = Graph.from_json(json.loads(held["resolved"]) | {"bundle": _bundle(json.loads(held["bundle"]))})
@@ -174,10 +170,8 @@ def check_type(recording: PlayableStreams, graph: Graph, stream: str) -> None:
 
 
 def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str, int]:
-    """Returns the stamps that streams ended with in the recorded run, where the recording holds them.
-
-    Raises `RecordingError` where it cannot be read.
-    """
+    """Returns the stamps that streams ended with in the recorded run, where the recording holds them. Raises
+    `RecordingError` where it cannot be read."""
     ends = recording.metadata.get(ENDS, {})
     finals: dict[str, int] = {}
     for stream in streams:

@@ -21,12 +21,12 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from dataflow.interop.conversions import CONVERSIONS
     from dataflow.interop.ros.outward import OUTWARD
-    from dataflow.ros.source import latched_source_of, source_of
+    from dataflow.ros.source import source_of
 
     known = {kind.__name__: kind for kind in (*OUTWARD, *(to for _, to in CONVERSIONS))}
     static = name.removeprefix("Static")
     if static not in known:
         raise AttributeError(f"module {__name__!r} has no source {name!r}; it has one for {', '.join(sorted(known))}")
-    made = latched_source_of(known[static]) if static != name else source_of(known[static])
+    made = source_of(known[static], latched=static != name)
     globals()[name] = made
     return made

@@ -332,34 +332,19 @@ class Ros2Source(Subscriber):
     )
 
 
-_TYPE = Param("", doc="its ROS type; none takes that of its first publisher")
-
-
-def _types_of(message: type[Message]) -> Any:
-    """Returns the ROS types whose messages become those of a type, as a parameter takes them."""
-    return Literal[("", *(name for name, (becomes, _) in MAPPED.items() if message in offers(becomes)))]
-
-
-def source_of(message: type[Message]) -> type[Subscriber]:
-    """Returns the source of a ROS topic whose messages become those of a type."""
-    made = {
-        "__module__": "dataflow.ros",
-        "__doc__": f"{message.__name__} messages of a ROS 2 topic.",
-        "__annotations__": {"message": Out[message], "lost": Out[Number], "type": _types_of(message)},  # type: ignore[valid-type]
-        "type": _TYPE,
-        "message": Out(doc="the messages"),
-        "lost": Out(doc="messages lost so far on the side of ROS; with the first message after each gap, and again"),
-    }
-    return type(message.__name__, (Subscriber,), made)
-
-
-def latched_source_of(message: type[Message]) -> type[Subscriber]:
-    """Returns the source of a latched ROS topic as a static stream of a type."""
-    made = {
-        "__module__": "dataflow.ros",
-        "__doc__": f"The {message.__name__} of a latched ROS 2 topic, valid always.",
-        "__annotations__": {"message": Out[message], "type": _types_of(message)},  # type: ignore[valid-type]
-        "type": _TYPE,
-        "message": Out(static=True, doc="what was latched at the start"),
-    }
-    return type(f"Static{message.__name__}", (Latched,), made)
+def source_of(message: type[Message], *, latched: bool = False) -> type[Subscriber]:
+    """Returns the source of a ROS topic whose messages become those of a type; of a latched one as a static stream."""
+    name = message.__name__
+    types: Any = Literal[("", *(kind for kind, (becomes, _) in MAPPED.items() if message in offers(becomes)))]
+    annotations: dict[str, Any] = {"message": Out[message], "type": types}  # type: ignore[valid-type]
+    made: dict[str, Any] = {"__module__": "dataflow.ros", "__annotations__": annotations}
+    made["type"] = Param("", doc="its ROS type; none takes that of its first publisher")
+    if latched:
+        made["__doc__"] = f"The {name} of a latched ROS 2 topic, valid always."
+        made["message"] = Out(static=True, doc="what was latched at the start")
+        return type(f"Static{name}", (Latched,), made)
+    annotations["lost"] = Out[Number]
+    made["__doc__"] = f"{name} messages of a ROS 2 topic."
+    made["message"] = Out(doc="the messages")
+    made["lost"] = Out(doc="messages lost so far on the side of ROS; with the first message after each gap, and again")
+    return type(name, (Subscriber,), made)

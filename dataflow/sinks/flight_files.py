@@ -6,7 +6,7 @@ import json
 import queue
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import FLIGHT
-from dataflow.records.cuts import Held, cut_record
+from dataflow.records.cuts import Held
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 
@@ -102,14 +102,6 @@ def _records(segments: list[Segment], prologue: dict[str, list[FiringRecord]]) -
         listed = records.get(operator, [])
         at = next((k for k, record in enumerate(listed) if record.kind == "cut"), None)
         if at is not None:
-            cut = listed[at]
-            again = cut_record(cut, left_out=0, taken=None, held=held, stamp=cut.stamp)
-            listed[at] = FiringRecord(
-                cut.operator,
-                cut.incarnation,
-                cut.index,
-                "cut",
-                cut.stamp,
-                detail={**cut.detail, "held": again.detail["held"]},
-            )
+            detail = {**listed[at].detail, "held": [list(message) for message in held]}
+            listed[at] = replace(listed[at], detail=detail)
     return records

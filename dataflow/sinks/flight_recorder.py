@@ -27,6 +27,7 @@ from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.sinks.flight_files import FlightFiles, Segment
 from dataflow.sinks.outage import Lost, Outage
 from dataflow.sinks.recorder import GOES_ON, RecorderSink
+from dataflow.sinks.sink import StreamSink
 from dataflow.sinks.triggers import Triggers
 from dataflow.sync.stamps import format_stamp
 
@@ -51,7 +52,7 @@ class Wanted:
     """Time (s, of a clock that goes on while the recorder runs) at which it was seen to be over; None until then."""
 
 
-class FlightSink:
+class FlightSink(StreamSink):
     """Takes everything, keeps little. Kept files are joined on a separate thread, so that nothing waits for it."""
 
     def __init__(self, folder: Path, graph: Graph, streams: list[str], options: Mapping[str, Any]) -> None:
@@ -130,9 +131,6 @@ class FlightSink:
 
     def log(self, line: LogLine) -> None:
         self._store(lambda sink: sink.log(line))
-
-    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
-        """Sums of operators are told by their finish records."""
 
     def flush(self) -> None:
         """Hands everything to the operating system, about once a second; a disk that had refused is tried again."""

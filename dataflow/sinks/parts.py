@@ -30,6 +30,7 @@ from dataflow.records.cuts import Held
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
 from dataflow.sinks.outage import Lost, Outage
 from dataflow.sinks.recorder import GOES_ON, RecorderSink
+from dataflow.sinks.sink import StreamSink
 from dataflow.video.group import Groups
 
 SETTLES = 1.0
@@ -53,7 +54,7 @@ class Part:
     abandoned: bool = False
 
 
-class PartsSink:
+class PartsSink(StreamSink):
     """Takes everything that a run gives, and stores it in the files of one recording.
 
     `options`: those of `RecorderSink`, and `storage`. `life`: how many recorders the run has had, this one included.
@@ -155,9 +156,6 @@ class PartsSink:
     def log(self, line: LogLine) -> None:
         if (part := self._current) is not None:
             self._store(part, lambda: part.sink.log(line))
-
-    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
-        """Sums of operators are told by their finish records."""
 
     def flush(self) -> None:
         """Hands everything to the operating system, about once a second; a disk that had refused is tried again."""

@@ -137,9 +137,6 @@ class RecorderSink:
         else:
             self._early_logs.append(line)
 
-    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
-        """Sums of operators are told by their finish records."""
-
     def flush(self) -> None:
         self.writer.flush()
         self._flushed = {operator: self._saved_batches(operator) for operator in self._unflushed}

@@ -10,7 +10,7 @@ import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.awake import AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.priority import let_others_begin
 from dataflow.process.streams.inbox import Inbox
 from dataflow.process.streams.inlet import Inlet
 from dataflow.process.streams.losses import losses_of
@@ -41,7 +42,7 @@ DRAIN_WITHIN = 5.0
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
     """Configuration of a sink process, from its supervisor: `kind` is "record" or "view", `options` belong to the
-    kind, `rings_in` are the keys of each link from another process, `life` counts the processes in its place."""
+    kind, `links_in` are the keys of each link from another process, `life` counts the processes in its place."""
 
     label: str
     kind: str
@@ -49,37 +50,42 @@ class SinkConfig:
     streams: list[str]
     firings: list[str]
     options: dict[str, Any]
-    rings_in: Sequence[Sequence[str]] = ()
+    links_in: Sequence[Sequence[str]] = ()
     live: bool = False
     life: int = 1
 
 
-class StreamSink(Protocol):
-    """Takes what a sink process is given."""
+class StreamSink:
+    """Takes what a sink process is given; what a kind of sink has no use for, it passes over."""
 
-    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        """Takes a message of a stream."""
+        raise NotImplementedError
 
     def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
         """Takes a batch of firing records, as it came and decoded."""
 
-    def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        """A stream has ended."""
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
         """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
-        """Returns how every operator fares."""
+        """Takes how every operator fares."""
 
     def log(self, line: LogLine) -> None:
         """An operator has logged or printed something."""
 
     def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
-        """Operators have ended, and this is what each sums up."""
+        """Operators have ended, and this is what each sums up, as their finish records do."""
 
-    def flush(self) -> None: ...
+    def flush(self) -> None:
+        """Hands everything to the operating system, about once a second."""
 
     def close(self, outcome: str) -> Mapping[str, Any]:
         """Completes the output; `outcome` is "complete" or the reason why the run ended. Returns what it wrote."""
+        raise NotImplementedError
 
 
 class SinkFailure(RuntimeError):
@@ -90,11 +96,7 @@ class SinkProcess:
     """Takes streams until all have ended or the supervisor ends it."""
 
     def __init__(
-        self,
-        config: SinkConfig,
-        channel: Channel,
-        inbox: Inbox,
-        make_sink: Callable[[SinkConfig, Graph], StreamSink],
+        self, config: SinkConfig, channel: Channel, inbox: Inbox, make_sink: Callable[[SinkConfig, Graph], StreamSink]
     ) -> None:
         self.config, self.channel, self.inbox = config, channel, inbox
         self.graph = Graph.from_json(config.graph)
@@ -329,6 +331,18 @@ class SinkProcess:
         if self.sink is not None:
             facts = self.sink.close(self._outcome)
         return facts
+
+
+class LiveSinkProcess(SinkProcess):
+    """A sink of a live run, beside devices that do not wait: it gives way to operators."""
+
+    def open(self) -> None:
+        super().open()
+        let_others_begin()
+
+    def _reached(self) -> dict[str, int]:
+        """Returns up to where it has taken what follows from each source; streams of operators that drop do not."""
+        return dict(self._taken)
 
 
 def _diagnostics(fields: Mapping[str, Any]) -> Diagnostics:

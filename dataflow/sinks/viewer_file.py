@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
-from dataflow.messages import Alarm, Diagnostics
+from dataflow.messages import Alarm
 from dataflow.messages.base import Message
 from dataflow.names import logs_key
 from dataflow.recording import LogLine
-from dataflow.records.firing import FiringRecord
-from dataflow.sinks.sink import SinkFailure
+from dataflow.sinks.sink import SinkFailure, StreamSink
 from dataflow.view import Save, ViewerSink, as_alarm
 
 PATIENCE = 30.0
 
 
-class ViewerFileSink:
+class ViewerFileSink(StreamSink):
     """Draws every message of the shown streams into one file."""
 
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
@@ -34,15 +33,6 @@ class ViewerFileSink:
         if self.viewer.statistics().dropped > dropped:
             raise SinkFailure(f"{self.path} took nothing for {PATIENCE:g} s")
 
-    def firings(self, operator: str, records: Sequence[FiringRecord], payload: bytes) -> None:
-        """Firing records are not shown."""
-
-    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
-        """Events of the run are told by the recording."""
-
-    def diagnostics(self, message: Diagnostics) -> None:
-        """Diagnostics of the run are told by the recording and by `dataflow top`."""
-
     def log(self, line: LogLine) -> None:
         self.viewer.log(self._logs, as_alarm(line, self._clock), wait=PATIENCE)
 
@@ -50,18 +40,8 @@ class ViewerFileSink:
         """Shows the scores among them."""
         self.viewer.scores(found)
 
-    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        """A stream that ended stays as it is."""
-
-    def flush(self) -> None:
-        """The viewer's own thread writes as it draws."""
-
     def close(self, outcome: str) -> Mapping[str, Any]:
         self.viewer.close(timeout=PATIENCE)
         drawn = self.viewer.statistics()
-        return {
-            "path": str(self.path),
-            "messages": drawn.drawn,
-            "failed": drawn.failed,
-            "bytes": self.path.stat().st_size,
-        }
+        size = self.path.stat().st_size
+        return {"path": str(self.path), "messages": drawn.drawn, "failed": drawn.failed, "bytes": size}

@@ -39,10 +39,10 @@ from dataflow.recording.streams.facts import machine_facts
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
+from dataflow.supervision.links import Links
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import ProcessPlan
-from dataflow.supervision.rings import Rings
-from dataflow.transport import Bus, Fanout, reserve_endpoints
+from dataflow.transport import Bus, Fanout, Reservation
 from dataflow.transport.publisher import undeclare
 
 HELLO_EVERY = 0.25
@@ -88,7 +88,7 @@ class Agent:
         self.folder.mkdir(parents=True, exist_ok=True)
         os.chdir(self.folder)
         with (
-            reserve_endpoints(1) as reserved,
+            Reservation(1) as reserved,
             contextlib.closing(router(reserved.endpoints, (self._endpoint,), more)) as bus,
         ):
             threading.Thread(target=self._greet, args=(bus,), name="hello", daemon=True).start()
@@ -311,21 +311,21 @@ class Stay:
         self._corrected = frozenset(label for label, process in processes.items() if corrected & {*process.nodes})
         gate = wanted["gate"]["label"]
         self._pipe.bounded = wanted["live"]
-        rings = Rings([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
-        stack.callback(rings.close)
-        given = take_descriptors(rings.handed(gate), wanted["gate"])
+        links = Links([*processes, gate], {(maker, taker): tuple(keys) for maker, taker, keys in wanted["pairs"]})
+        stack.callback(links.close)
+        given = take_descriptors(links.handed(gate), wanted["gate"])
         fanout = Fanout(given.outgoing, pool_bytes=POOL_BYTES)
         stack.callback(fanout.close)
         inbox = Inbox(given.wake, given.incoming)
         stack.callback(inbox.close)
         self._gate = self._gate_of(inbox, fanout, Routes.from_json(wanted["routes"]))
-        reserved = stack.enter_context(contextlib.closing(reserve_endpoints(len(processes))))
+        reserved = stack.enter_context(contextlib.closing(Reservation(len(processes))))
         self._endpoints = dict(zip(processes, reserved.endpoints, strict=True))
         common = environment(graph.threads)
         apart = nurseries_of({label: process.env for label, process in processes.items()}, common)
         nursery = Nursery(common)
         boxes = Boxes(graph, processes, live=wanted["live"])
-        self._children = Children(nursery, apart, self._selector, rings, boxes, self._clock, self._feed, self._printed)
+        self._children = Children(nursery, apart, self._selector, links, boxes, self._clock, self._feed, self._printed)
         stack.callback(self._children.bury)
         self._say("", "ready", facts=machine_facts(common))
 

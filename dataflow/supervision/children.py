@@ -14,8 +14,8 @@ from typing import Any
 from dataflow.process.channel import ChannelClosed
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.core import events
+from dataflow.supervision.links import Links
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
-from dataflow.supervision.rings import Rings
 
 NOT_READING_AFTER = 1.0
 """Seconds for which a process may leave what was sent to it, before the core is notified."""
@@ -32,13 +32,13 @@ class Children:
         nursery: Nursery,
         apart: Mapping[str, Nursery],
         selector: selectors.BaseSelector,
-        rings: Rings,
+        links: Links,
         boxes: Boxes,
         clock: Callable[[], float],
         feed: Callable[[events.Event], None],
         printed: Callable[[str, str], None],
     ) -> None:
-        self._nursery, self._apart, self._selector, self._rings, self._boxes = nursery, apart, selector, rings, boxes
+        self._nursery, self._apart, self._selector, self._links, self._boxes = nursery, apart, selector, links, boxes
         self._clock, self._feed, self._printed = clock, feed, printed
         self._children: dict[str, Child] = {}
         self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
@@ -149,7 +149,7 @@ class Children:
         """Starts a process, which waits for its configuration."""
         try:
             box = self._boxes.make(label)
-            child = self._nursery_of(label).spawn((*self._rings.handed(label), *box))
+            child = self._nursery_of(label).spawn((*self._links.handed(label), *box))
         except (NurseryFailed, OSError) as failure:
             self._feed(events.Aborted(str(failure)))
             return

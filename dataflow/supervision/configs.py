@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dataflow.supervision.links import pairs_of
 from dataflow.supervision.plan import LogPlan, ProcessPlan, RunPlan
-from dataflow.supervision.rings import pairs_of
 
 BEYOND_A_LINK = 64
 """Windows of messages that the live sources of another machine may be ahead."""
@@ -25,11 +25,11 @@ def configurations(
     configs: dict[str, Config] = {}
     graph, pairs = plan.graph.to_json(), pairs_of(plan.graph, processes)
     for label, process in processes.items():
-        rings_in = [list(keys) for (_, taker), keys in pairs.items() if taker == label]
-        common = {"label": label, "graph": graph, "live": plan.live, "rings_in": rings_in}
+        links_in = [list(keys) for (_, taker), keys in pairs.items() if taker == label]
+        common = {"label": label, "graph": graph, "live": plan.live, "links_in": links_in}
         if process.sink is None:
             configs[label] = _operators(plan, process, common, endpoints, label == first)
-            configs[label][1]["rings_out"] = [
+            configs[label][1]["links_out"] = [
                 (plan.live and taker in processes and processes[taker].sink is None, list(keys))  # a gate takes all
                 for (maker, taker), keys in pairs.items()
                 if maker == label

@@ -41,7 +41,7 @@ environment of the processes to come and the libraries to load for them."""
 PRELOAD = (
     "dataflow.process.operator_process",
     "dataflow.process.log_pipe",
-    "dataflow.sinks.live_sink",
+    "dataflow.sinks.sink",
     "dataflow.sinks.recorder",
     "dataflow.supervision.process_main",
 )

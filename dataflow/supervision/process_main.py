@@ -46,8 +46,7 @@ def _listen(channel: Channel, inbox: Inbox) -> None:
 def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: Inbox, handed: Descriptors) -> Any:
     """Makes the process that the supervisor asks for: "operators" runs operators, "sink" takes whole streams."""
     if kind == "sink":
-        from dataflow.sinks.live_sink import LiveSinkProcess
-        from dataflow.sinks.sink import SinkConfig, SinkProcess
+        from dataflow.sinks.sink import LiveSinkProcess, SinkConfig, SinkProcess
 
         sink = SinkConfig(**config)
         make_sink = _recorder if sink.kind == "record" else _viewer_file

@@ -23,8 +23,8 @@ from dataflow.records.black_box import Reached, Remains
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
+from dataflow.supervision.links import Pairs, gate_of
 from dataflow.supervision.plan import LINK, Meeting, ProcessPlan, RunPlan
-from dataflow.supervision.rings import Pairs, gate_of
 
 PIECES_ON_THE_WAY = 4
 """Pieces of files that were sent to a machine before it took the first of them."""
@@ -304,4 +304,4 @@ def link_of(live: bool, processes: Mapping[str, ProcessPlan], pairs: Pairs, gate
         [live and processes[taker].sink is None, list(keys)] for (maker, taker), keys in pairs.items() if maker == gate
     ]
     incoming = [list(keys) for (_, taker), keys in pairs.items() if taker == gate]
-    return {"label": gate, "rings_out": outgoing, "rings_in": incoming}
+    return {"label": gate, "links_out": outgoing, "links_in": incoming}

@@ -28,10 +28,10 @@ from dataflow.supervision.core import commands, events
 from dataflow.supervision.core.compose import core_of
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
 from dataflow.supervision.early_nursery import EarlyNursery
+from dataflow.supervision.links import Links, Pairs, pairs_of
 from dataflow.supervision.nursery import Nursery, adopting, nurseries_of
 from dataflow.supervision.plan import LINK, RECORDER, RunPlan, process_plans
-from dataflow.supervision.rings import Pairs, Rings, pairs_of
-from dataflow.transport import registry, reserve_endpoints
+from dataflow.transport import Reservation, registry
 from dataflow.transport.log_file import LogFile
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Supervisor:
         self._early = early
         self._processes = process_plans(plan)
         labels = [*self._processes, *([LINK] if any(p.machine for p in self._processes.values()) else ())]
-        self._reserved = reserve_endpoints(len(labels))
+        self._reserved = Reservation(len(labels))
         self._endpoints = dict(zip(labels, self._reserved.endpoints, strict=True))
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
@@ -101,8 +101,8 @@ class Supervisor:
             stack.enter_context(self._announced)
             pairs = pairs_of(self.plan.graph, self._processes)
             here = [label for label in self._endpoints if label == LINK or self._processes[label].machine is None]
-            rings = self._make_rings(here, pairs)
-            stack.callback(rings.close)
+            links = self._make_links(here, pairs)
+            stack.callback(links.close)
             self._log_file = stack.enter_context(contextlib.closing(LogFile()))
             self._words = Console(self._on_output)
             stack.callback(self._words.close)
@@ -113,7 +113,7 @@ class Supervisor:
                 self._start_nursery(),
                 apart,
                 self._selector,
-                rings,
+                links,
                 self._boxes,
                 self._clock,
                 self._feed_here,
@@ -130,9 +130,9 @@ class Supervisor:
         assert over.report is not None
         return over.report
 
-    def _make_rings(self, here: list[str], pairs: Pairs) -> Rings:
+    def _make_links(self, here: list[str], pairs: Pairs) -> Links:
         try:
-            return Rings(here, {pair: keys for pair, keys in pairs.items() if set(pair) <= set(here)})
+            return Links(here, {pair: keys for pair, keys in pairs.items() if set(pair) <= set(here)})
         except OSError as error:
             raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 

@@ -72,16 +72,10 @@ def on_ray(
         return
     import ray  # of the extra `ray`
 
-    here = address == "local"
-    where: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False} if here else {}
+    where: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False} if address == "local" else {}
+    env = {"env_vars": {**variables, "PYTHONPATH": import_path()}}
     try:
-        ray.init(
-            address=address,
-            log_to_driver=False,
-            logging_level="ERROR",
-            runtime_env={"env_vars": {**variables, "PYTHONPATH": import_path()}},
-            **where,
-        )
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", runtime_env=env, **where)
     except Exception as error:  # Ray raises it bare where a node does not start
         raise SweepError(
             f"--ray {address}: {error}; 'local' begins a cluster here, 'auto' takes a running one"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ def summed_up(tasks: Iterable[Task], store: Store) -> list[dict[str, Any]]:
     `dropped` messages, `cpu_s`, and `figures`: "operator: name" → mean, standard deviation, number of recordings.
     """
     found: dict[Choice, dict[str, Any]] = {}
-    figures: dict[Choice, dict[str, _Moments]] = {}
+    figures: dict[Choice, dict[str, list[float]]] = {}
     for task in tasks:
         here = found.setdefault(
             task.settings,
@@ -143,33 +144,18 @@ def summed_up(tasks: Iterable[Task], store: Store) -> list[dict[str, Any]]:
                 if verdict in ("culprit", "changed"):
                     _count(here["culprits"], row["operator"])
             for name, value in finite(row):
-                figures.setdefault(task.settings, {}).setdefault(f"{row['operator']}: {name}", _Moments()).add(value)
+                figures.setdefault(task.settings, {}).setdefault(f"{row['operator']}: {name}", []).append(value)
     for settings, summary in found.items():
-        summary["figures"] = {name: moments.as_json() for name, moments in figures.get(settings, {}).items()}
+        summary["figures"] = {
+            name: {"mean": statistics.fmean(values), "std": statistics.pstdev(values), "recordings": len(values)}
+            for name, values in figures.get(settings, {}).items()
+        }
     return list(found.values())
 
 
 def finite(row: Mapping[str, Any]) -> list[tuple[str, float]]:
     """Returns the figures of a row that are numbers one can take a mean of."""
     return [(name, value) for name, value in row.get("figures", {}).items() if math.isfinite(value)]
-
-
-@dataclass(slots=True)
-class _Moments:
-    """Mean and spread of numbers that are not kept (Welford 1962)."""
-
-    count: int = 0
-    mean: float = 0.0
-    squares: float = 0.0
-
-    def add(self, value: float) -> None:
-        self.count += 1
-        before = value - self.mean
-        self.mean += before / self.count
-        self.squares += before * (value - self.mean)
-
-    def as_json(self) -> dict[str, float]:
-        return {"mean": self.mean, "std": math.sqrt(self.squares / self.count), "recordings": self.count}
 
 
 def _count(counts: dict[str, int], name: str) -> None:

@@ -52,10 +52,8 @@ class StreamEnd(NamedTuple):
 
 
 class Aligner:
-    """Decides one operator's firings. `push`, `advance` and `end` tell it what streams said; `poll` asks.
-
-    One thread at a time. Frontiers and stamps are integer nanoseconds.
-    """
+    """Decides one operator's firings. `push`, `advance` and `end` tell it what streams said; `poll` asks. One thread at
+    a time. Frontiers and stamps are integer nanoseconds."""
 
     def __init__(self, spec: AlignSpec) -> None:
         self.spec = spec
@@ -94,10 +92,8 @@ class Aligner:
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:
-        """A message arrives; it implies the frontier at its stamp.
-
-        Raises StreamOrderError if the stream had promised that there would be no such message.
-        """
+        """A message arrives; it implies the frontier at its stamp. Raises StreamOrderError if the stream had promised
+        that there would be no such message."""
         state = self._streams.get(stream) or self._inputs.stream(stream)
         if entry.incarnation > state.incarnation and entry.stamp < FOREVER:
             self.reset(stream, entry.incarnation)
@@ -123,10 +119,8 @@ class Aligner:
                 lane.frontier = frontier
 
     def advance(self, stream: str, frontier: int) -> None:
-        """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back.
-
-        Raises StreamOrderError for a frontier at the end of time, where `end` is meant.
-        """
+        """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back. Raises
+        StreamOrderError for a frontier at the end of time, where `end` is meant."""
         state = self._inputs.stream(stream)
         if state.advance(frontier):
             self._undecided.settled = False
@@ -206,11 +200,8 @@ class Aligner:
     # What comes out
 
     def poll(self, most: int | None = None) -> Firing | None:
-        """The next firing, or None while it is not decided. The last one has kind "finish".
-
-        None also after `most` decided stamps that were dropped instead of fired; `paused` then shows that there is
-        more to decide.
-        """
+        """The next firing, or None while it is not decided. The last one has kind "finish". None also after `most`
+        decided stamps that were dropped instead of fired; `paused` then shows that there is more to decide."""
         self.paused = False
         if self._finished:
             return None
@@ -232,10 +223,8 @@ class Aligner:
         return None
 
     def output_frontier(self) -> int:
-        """No firing that `poll` has still to return has a stamp at or below this. It never goes back.
-
-        A firing that poll has returned counts as done: until its messages are out, promise its stamp - 1.
-        """
+        """No firing that `poll` has still to return has a stamp at or below this. It never goes back. A firing that
+        poll has returned counts as done: until its messages are out, promise its stamp - 1."""
         if self._finished:
             return FOREVER
         undecided = self._undecided

@@ -18,18 +18,7 @@ PRUNE_AT = 32
 class StreamState:
     """Holds what a stream has said about itself, whatever inputs it feeds, and whether it keeps to it."""
 
-    __slots__ = (
-        "ended",
-        "final",
-        "first",
-        "floor",
-        "incarnation",
-        "lanes",
-        "last",
-        "name",
-        "promised",
-        "static",
-    )
+    __slots__ = ("ended", "final", "first", "floor", "incarnation", "lanes", "last", "name", "promised", "static")
 
     def __init__(self, name: str, static: bool) -> None:
         self.name = name

@@ -55,11 +55,8 @@ class Uses:
 
 
 class RecordedAligner:
-    """Makes recorded firings again, each as soon as all its messages are there.
-
-    `uses`: how often the firings to come take each message. Only those are held, each until its last firing. Whatever
-    else arrives is let go at once.
-    """
+    """Makes recorded firings again, each as soon as all its messages are there. `uses`: how often the firings to come
+    take each message. Only those are held, each until its last firing. Whatever else arrives is let go at once."""
 
     def __init__(self, spec: AlignSpec, uses: Uses) -> None:
         self._streams = frozenset(spec.streams)

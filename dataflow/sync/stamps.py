@@ -37,10 +37,8 @@ def trail(frontier: int, lag: int) -> int:
 
 
 def parse_duration(value: str | int) -> int:
-    """Nanoseconds of a duration such as ``"100ms"``, ``"1.5s"`` or ``"2min"``; an int is nanoseconds.
-
-    Decimals are exact: a duration that is not a whole number of nanoseconds is refused, never rounded.
-    """
+    """Nanoseconds of a duration such as ``"100ms"``, ``"1.5s"`` or ``"2min"``; an int is nanoseconds. Decimals are
+    exact: a duration that is not a whole number of nanoseconds is refused, never rounded."""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
         raise ValueError(
             f"duration {value!r}: expected a number with a unit, such as '100ms', or nanoseconds as an int"

@@ -9,11 +9,8 @@ from dataflow.sync.stamps import FOREVER, NEVER
 
 
 class Ticks:
-    """Grid points k * period from the smallest first to the largest final stamp of the bounding streams.
-
-    A final stamp is never below a frontier promised before it, so one frontier at g proves that a tick at g
-    exists.
-    """
+    """Grid points k * period from the smallest first to the largest final stamp of the bounding streams. A final stamp
+    is never below a frontier promised before it, so one frontier at g proves that a tick at g exists."""
 
     def __init__(self, period: int, lanes: Sequence[Lane]) -> None:
         self._period = period

@@ -12,11 +12,8 @@ from dataflow.sync.ticks import Ticks
 
 
 class Undecided:
-    """Finds the first undecided stamp among those of triggers and of ticks.
-
-    `stamp` to `ready` hold after `settle()`. Code that changes a lane of a trigger or a bounding stream, or decides,
-    sets `settled` to False.
-    """
+    """Finds the first undecided stamp among those of triggers and of ticks. `stamp` to `ready` hold after `settle()`.
+    Code that changes a lane of a trigger or a bounding stream, or decides, sets `settled` to False."""
 
     __slots__ = ("_lanes", "_ticks", "_triggers", "decided", "ready", "settled", "stamp", "ticked", "triggered")
 

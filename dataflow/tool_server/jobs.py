@@ -215,7 +215,7 @@ def answered_there(part: Callable[..., Any], arguments: Mapping[str, Any], say: 
     tool = part.__name__
     python, variables = place_of(tool, arguments)
     if in_same(variables):
-        return part(**arguments, say=say)
+        return part(**{name: value for name, value in arguments.items() if name != "path"}, say=say)
     command = [python, "-P", "-m", "dataflow.tool_server.work"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=variables, **pipes) as process:  # it ends with the group of this one

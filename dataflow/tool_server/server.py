@@ -24,6 +24,8 @@ Recordings are files (.mcap) on this machine; graph is a graph file, path are fo
 An answer has at most {MOST_BYTES} bytes and names how to ask for the rest. A call of more than five seconds is
 answered by a job: ask for it with job(id)."""
 
+PATH = inspect.Parameter("path", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=list[str] | None)
+
 
 def serve() -> None:
     """Serves one agent, until it closes standard input."""
@@ -70,7 +72,14 @@ class _Server(MCPServer):
 
 def _taken(tool: Callable[..., Any]) -> list[str]:
     """Returns the arguments that agents give to a tool."""
-    return [name for name in inspect.signature(tool).parameters if name != "say"]
+    return [each.name for each in _parameters(tool)]
+
+
+def _parameters(tool: Callable[..., Any]) -> list[inspect.Parameter]:
+    """The parameters that agents see: every tool but `job` also takes the folders of modules."""
+    parameters = inspect.signature(tool, eval_str=True).parameters
+    known = {name: each for name, each in parameters.items() if name != "say"}
+    return list((known if tool is _job else {**known, "path": PATH}).values())
 
 
 def _job(id: str | int, offset: int = 0, cancel: bool = False) -> Any:
@@ -93,7 +102,5 @@ def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str
     del call.__wrapped__
     call.__name__ = tool.__name__.lstrip("_")
     call.__doc__ = inspect.cleandoc(tool.__doc__ or "")
-    signature = inspect.signature(tool, eval_str=True)
-    given = [each for each in signature.parameters.values() if each.name != "say"]
-    call.__signature__ = signature.replace(parameters=given)  # type: ignore[attr-defined]
+    call.__signature__ = inspect.Signature(_parameters(tool), return_annotation=Any)  # type: ignore[attr-defined]
     return call

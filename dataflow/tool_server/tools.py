@@ -38,9 +38,7 @@ class ToolError(ValueError):
     """Raised for arguments that do not fit; the message has what would be right."""
 
 
-def verify(
-    recording: str, only: list[str] | None = None, graph: str | None = None, path: list[str] | None = None
-) -> Any:
+def verify(recording: str, only: list[str] | None = None, graph: str | None = None) -> Any:
     """Re-execute a recorded run with the code as it is now and compare every output, bit for bit.
 
     A culprit was given the recorded inputs and made another output; `first` is its first differing call, with the
@@ -50,7 +48,7 @@ def verify(
     return _verified(_verify(_file(recording), only, _loaded(graph)))
 
 
-def why(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None, *, say: Say) -> Any:
+def why(recording: str, operator: str, graph: str | None = None, *, say: Say) -> Any:
     """Find why a culprit of `verify` does not repeat: at most 8 re-runs of it with clocks, random numbers, threads,
     hashes, memory and files fixed in turn. Gives causes with the lines that led to them."""
     from dataflow.causes.ladder import MOST
@@ -68,7 +66,7 @@ def why(recording: str, operator: str, graph: str | None = None, path: list[str]
     return find(file, report, operator, graph=loaded, workers=told).as_json()
 
 
-def goto(recording: str, operator: str, call: CallName, graph: str | None = None, path: list[str] | None = None) -> Any:
+def goto(recording: str, operator: str, call: CallName, graph: str | None = None) -> Any:
     """Make one recorded call of an operator again: what it was given, made, and changed, against the recording.
 
     `call`: its number (0 is the first, -1 the last), "@12.3" (the last one by 12.3 s), or "diff" (the first that does
@@ -78,7 +76,7 @@ def goto(recording: str, operator: str, call: CallName, graph: str | None = None
         return _shown(_at(debugger, origin, call), debugger, origin)
 
 
-def diff(recording: str, operator: str, graph: str | None = None, path: list[str] | None = None) -> Any:
+def diff(recording: str, operator: str, graph: str | None = None) -> Any:
     """Go to the first call of an operator that does not give what was recorded, and show it as `goto` does. Where all
     give it, `same` is true."""
     with _debugger(recording, operator, graph) as (debugger, origin, _):
@@ -88,14 +86,7 @@ def diff(recording: str, operator: str, graph: str | None = None, path: list[str
         return _shown(_at(debugger, origin, "diff") if found is None else found, debugger, origin)
 
 
-def state(
-    recording: str,
-    operator: str,
-    call: CallName,
-    part: str = "",
-    graph: str | None = None,
-    path: list[str] | None = None,
-) -> Any:
+def state(recording: str, operator: str, call: CallName, part: str = "", graph: str | None = None) -> Any:
     """Show the state of an operator before and after a call (as in `goto`): the parts it changed, or the one named."""
     with _debugger(recording, operator, graph) as (debugger, origin, _):
         fired = _at(debugger, origin, call)
@@ -109,9 +100,7 @@ def state(
         return {"call": fired.number, "parts": sorted({*before, *after}), "part" if part else "changed": shown}
 
 
-def lines(
-    recording: str, operator: str, call: CallName = "diff", graph: str | None = None, path: list[str] | None = None
-) -> Any:
+def lines(recording: str, operator: str, call: CallName = "diff", graph: str | None = None) -> Any:
     """Name the lines that can have made a call of an operator other than recorded (`call` as in `goto`).
 
     `changes`: where the operator's code differs from that which was recorded, as far as that is in git's commits or was
@@ -135,15 +124,7 @@ def lines(
     return values if found.changes else values | {"ran": ranges(found.ran)}
 
 
-def history(
-    recording: str,
-    operator: str,
-    field: str,
-    first: int = 0,
-    last: int = -1,
-    graph: str | None = None,
-    path: list[str] | None = None,
-) -> Any:
+def history(recording: str, operator: str, field: str, first: int = 0, last: int = -1, graph: str | None = None) -> Any:
     """Give the value of a Python expression over the calls of an operator, from number `first` to `last`.
 
     It sees inp, out (by input and port: "len(out.tracks.ids)"), stamp, number, same, error. Calls that give the same
@@ -187,7 +168,6 @@ def what_if(
     params: dict[str, Any] | None = None,
     show: str = "",
     graph: str | None = None,
-    path: list[str] | None = None,
 ) -> Any:
     """Make one call of an operator again with other parameters, or with its source as it was edited, from the recorded
     inputs and state; compare with the recording.
@@ -235,15 +215,7 @@ def capture(
     return {"test": to, "wrong": found.wrong, "bytes": nbytes} | kept
 
 
-def blame(
-    recording: str,
-    field: str,
-    budget: float = 60.0,
-    graph: str | None = None,
-    path: list[str] | None = None,
-    *,
-    say: Say,
-) -> Any:
+def blame(recording: str, field: str, budget: float = 60.0, graph: str | None = None, *, say: Say) -> Any:
     """Find what decided a value: the chain of calls back to the sensors' messages, each shown by re-execution.
 
     `field`: STREAM.FIELD@SECONDS, such as "tracks.ids[3]@12.4"; `budget`: seconds to look for it. Where `whole` of the
@@ -261,15 +233,7 @@ def blame(
         return found.find().as_json()
 
 
-def drops(
-    recording: str,
-    worse: str,
-    budget: float = 60.0,
-    graph: str | None = None,
-    path: list[str] | None = None,
-    *,
-    say: Say,
-) -> Any:
+def drops(recording: str, worse: str, budget: float = 60.0, graph: str | None = None, *, say: Say) -> Any:
     """Find a smallest set of drops, late messages and timeouts of a live run without which its figures are not bad.
 
     `worse`: a Python expression over the figures, true where they are bad: "ate_rmse_m > 0.05"; `budget`: seconds.
@@ -356,7 +320,6 @@ def mended(
     alone: bool,
     params: dict[str, Any] | None,
     graph: str | None,
-    path: list[str] | None,
     *,
     say: Say,
 ) -> Any:
@@ -411,8 +374,8 @@ def answer(name: str, arguments: Mapping[str, Any], say: Say) -> Any:
         add_folder(folder)
     add_current_folder()
     tool = {**TOOLS, **PARTS}[name]
-    more = {"say": say} if "say" in inspect.signature(tool).parameters else {}
-    return tool(**arguments, **more)
+    unused = {"path", "say"} - inspect.signature(tool).parameters.keys()
+    return tool(**{name: value for name, value in {**arguments, "say": say}.items() if name not in unused})
 
 
 # ------------------------------------------------------------------------------------------------- inside

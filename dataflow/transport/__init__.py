@@ -7,17 +7,15 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from dataflow.transport.bus import Bus, Token
     from dataflow.transport.codec import decode, decode_head, encode, encode_parts
-    from dataflow.transport.counters import Counters
     from dataflow.transport.envelope import DecodeError, Envelope, Head, Kind, Limits
     from dataflow.transport.fanout import Fanout
     from dataflow.transport.links import Incoming, Outgoing
     from dataflow.transport.network import NetworkConfig, NetworkError
     from dataflow.transport.outside import OutsidePublisher
-    from dataflow.transport.publisher import BusError, StreamPublisher
-    from dataflow.transport.registry import RegistryError, RunningGraph, register, running
+    from dataflow.transport.publisher import BusError, Counters, StreamPublisher
+    from dataflow.transport.registry import RegistryError, Reservation, RunningGraph, register, running
     from dataflow.transport.ring import make_ring
     from dataflow.transport.shared import PoolReader, make_board
-    from dataflow.transport.sockets import Reservation, reserve_endpoints
     from dataflow.transport.tap_client import TapClient, TapMessage
     from dataflow.transport.tap_server import TapServer
     from dataflow.transport.taps import TapWindow
@@ -27,17 +25,15 @@ else:
         {
             "bus": ("Bus", "Token"),
             "codec": ("decode", "decode_head", "encode", "encode_parts"),
-            "counters": ("Counters",),
             "envelope": ("DecodeError", "Envelope", "Head", "Kind", "Limits"),
             "fanout": ("Fanout",),
             "links": ("Incoming", "Outgoing"),
             "network": ("NetworkConfig", "NetworkError"),
             "outside": ("OutsidePublisher",),
-            "publisher": ("BusError", "StreamPublisher"),
-            "registry": ("RegistryError", "RunningGraph", "register", "running"),
+            "publisher": ("BusError", "Counters", "StreamPublisher"),
+            "registry": ("RegistryError", "Reservation", "RunningGraph", "register", "running"),
             "ring": ("make_ring",),
             "shared": ("PoolReader", "make_board"),
-            "sockets": ("Reservation", "reserve_endpoints"),
             "tap_client": ("TapClient", "TapMessage"),
             "tap_server": ("TapServer",),
             "taps": ("TapWindow",),
@@ -76,6 +72,5 @@ __all__ = [
     "make_board",
     "make_ring",
     "register",
-    "reserve_endpoints",
     "running",
 ]

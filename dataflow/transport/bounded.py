@@ -7,10 +7,8 @@ from collections.abc import Callable
 
 
 def within(seconds: float, act: Callable[[], object], name: str) -> bool:
-    """Runs `act` on a thread called `name`, and returns whether it came to its end in so many seconds.
-
-    Raises what `act` raises. One that takes longer goes on, on its daemon thread, and its result is discarded.
-    """
+    """Runs `act` on a thread called `name`, and returns whether it came to its end in so many seconds. Raises what
+    `act` raises. One that takes longer goes on, on its daemon thread, and its result is discarded."""
     failures: list[BaseException] = []
 
     def run() -> None:

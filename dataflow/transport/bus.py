@@ -9,16 +9,15 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 import zenoh
 
 from dataflow.transport.bounded import within
-from dataflow.transport.counters import Counters
 from dataflow.transport.keys import static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
-from dataflow.transport.publisher import BusError, StreamPublisher, reason, undeclare
+from dataflow.transport.publisher import BusError, Counters, StreamPublisher, reason, undeclare
 
 CLOSE_WITHIN = 20.0
 
@@ -31,14 +30,6 @@ class Token:
 
     def close(self) -> None:
         undeclare(self._declared)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 @contextlib.contextmanager
@@ -62,10 +53,8 @@ class Bus:
     """One process's place in the network. Thread-safe; close it (it is a context manager)."""
 
     def __init__(self, config: NetworkConfig | None = None) -> None:
-        """Opens the session; peers that are not up yet are connected to later.
-
-        Raises `BusError` when an endpoint cannot be listened on, `NetworkError` for settings Zenoh does not take.
-        """
+        """Opens the session; peers that are not up yet are connected to later. Raises `BusError` when an endpoint
+        cannot be listened on, `NetworkError` for settings Zenoh does not take."""
         self.config = config or NetworkConfig()
         try:
             self.session = zenoh.open(self.config.zenoh_config())
@@ -193,7 +182,5 @@ class Bus:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

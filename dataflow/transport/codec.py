@@ -59,10 +59,8 @@ def encode_head(envelope: Envelope) -> bytes:
 
 
 def encode_parts(envelope: Envelope) -> list[Buffer]:
-    """Returns the envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
-
-    Raises `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`.
-    """
+    """Returns the envelope as consecutive buffers, arrays by reference: joined, they are the wire form. Raises
+    `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`."""
     message = envelope.message
     kind = envelope.kind
     if (message is not None) != (kind is _MESSAGE) or kind is _REFERENCE:
@@ -103,10 +101,8 @@ def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
 
 
 def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = message_type) -> Envelope:
-    """Returns the envelope in `buffer`, which must hold exactly one. `types` gives the class of a schema name.
-
-    The message's arrays are read-only views of `buffer`, which must not change afterwards. Raises only `DecodeError`.
-    """
+    """Returns the envelope in `buffer`, which must hold exactly one. `types` gives the class of a schema name. The
+    message's arrays are read-only views of `buffer`, which must not change afterwards. Raises only `DecodeError`."""
     if limits is DEFAULT_LIMITS and (found := _usual(buffer, types)) is not None:
         return found
     view = _bytes_view(buffer)
@@ -146,10 +142,8 @@ _head_unpackers: dict[int, Callable[[Any], Any]] = {}
 
 
 def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
-    """The envelope of a message with a small head and body, in one go; None where anything is rare, or wrong.
-
-    This is what nearly every envelope is, so no function is called here that need not be.
-    """
+    """The envelope of a message with a small head and body, in one go; None where anything is rare, or wrong. This is
+    what nearly every envelope is, so no function is called here that need not be."""
     try:
         magic, version, kind, head_bytes, body_bytes = PRELUDE.unpack_from(buffer)
         if kind != 1 or magic != MAGIC or version != VERSION or head_bytes > _SMALL_BODY or body_bytes > _SMALL_BODY:
@@ -318,13 +312,7 @@ def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits,
 
 
 def _array(
-    view: memoryview,
-    head: Head,
-    spec: ArrayField,
-    dtype: np.dtype[Any],
-    shape: tuple[int, ...],
-    offset: int,
-    size: int,
+    view: memoryview, head: Head, spec: ArrayField, dtype: np.dtype[Any], shape: tuple[int, ...], offset: int, size: int
 ) -> npt.NDArray[Any]:
     try:
         data: npt.NDArray[Any] = np.ndarray(shape, dtype, view, offset) if size else np.empty(shape, dtype)

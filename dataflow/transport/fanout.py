@@ -104,7 +104,7 @@ class Fanout:
             if not link.present():
                 continue
             if droppable and not link.may_borrow(size, pool.free):
-                link.refuse()
+                link.dropped += 1
             else:
                 able.append((link, channel))
         if not able:

@@ -18,14 +18,7 @@ from dataclasses import dataclass
 from dataflow.transport.envelope import Buffer, DecodeError
 from dataflow.transport.pool import Block
 from dataflow.transport.ring import READERS, RingReader, RingWriter
-from dataflow.transport.shared import (
-    BOARD_BYTES,
-    SLOTS,
-    Board,
-    PoolReader,
-    SharedMemoryError,
-    is_reference,
-)
+from dataflow.transport.shared import BOARD_BYTES, SLOTS, Board, PoolReader, SharedMemoryError, is_reference
 
 _FIRST, _LAST = 1 << 31, 1 << 30
 _WHOLE = _FIRST | _LAST
@@ -91,9 +84,7 @@ class Outgoing:
 
     def take_leave(self, life: int) -> None:
         """The consumer that was the process `life` in its place has died: what was meant for it is not sent any more.
-
-        This may be heard late, when another process is there already.
-        """
+        This may be heard late, when another process is there already."""
         self._new_reader()
         if self._reader <= life:
             self.away = True
@@ -130,10 +121,6 @@ class Outgoing:
         if taken != self._taken or taken == self._ring.written:
             self._taken, self._took_at = taken, now
         return now - self._took_at < STILL
-
-    def refuse(self) -> None:
-        """Drops a message that is not sent at all."""
-        self.dropped += 1
 
     def send(
         self, channel: int, parts: Sequence[Buffer], size: int, *, droppable: bool = True, block: Block | None = None

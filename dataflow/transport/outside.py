@@ -12,8 +12,7 @@ import threading
 import time
 from collections import deque
 
-from dataflow.transport.counters import Counters
-from dataflow.transport.publisher import BusError, StreamPublisher
+from dataflow.transport.publisher import BusError, Counters, StreamPublisher
 
 MOST_MESSAGES, MOST_BYTES = 4096, 256 << 20
 CLOSE_WITHIN = 2.0

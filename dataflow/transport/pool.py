@@ -112,10 +112,8 @@ class SharedPool:
         """Bytes of blocks whose arrays are held by this process, and of those that it has let go of since."""
 
     def room(self, nbytes: int) -> npt.NDArray[np.uint8] | None:
-        """Returns memory to make an array on, held until the last view of it is gone; None when there is none.
-
-        Never waits: None, too, while another thread is at the pool, or this one, whose work a finaliser interrupts.
-        """
+        """Returns memory to make an array on, held until the last view of it is gone; None when there is none. Never
+        waits: None, too, while another thread is at the pool, or this one, whose work a finaliser interrupts."""
         capacity = _capacity(BEFORE + nbytes)
         if not self._lock.acquire(blocking=False):
             return None

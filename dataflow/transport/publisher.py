@@ -4,13 +4,44 @@ from __future__ import annotations
 
 import re
 import sys
+import threading
 import time
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 
 from dataflow.transport.bounded import within
-from dataflow.transport.counters import Counters
+
+NAMES: Final = (
+    "published_messages",
+    "published_bytes",
+    "unpublished",  # not published because subscribers were too slow
+    "stalled",  # publications that waited until the link of a subscriber that took nothing was closed
+)
+
+
+class Counters:
+    """Counts what a process has published so far. Thread-safe: its main thread and its publisher both add to it."""
+
+    def __init__(self) -> None:
+        self._counts = dict.fromkeys(NAMES, 0)
+        self._lock = threading.Lock()
+
+    def add(self, name: str, number: int = 1) -> None:
+        """Adds to one count."""
+        with self._lock:
+            self._counts[name] += number
+
+    def published(self, nbytes: int) -> None:
+        """Counts one message of `nbytes`."""
+        with self._lock:
+            self._counts["published_messages"] += 1
+            self._counts["published_bytes"] += nbytes
+
+    def as_dict(self) -> dict[str, int]:
+        """Returns the counts by name."""
+        with self._lock:
+            return dict(self._counts)
 
 
 class BusError(RuntimeError):
@@ -28,10 +59,8 @@ UNDECLARE_WITHIN = 10.0
 
 
 def undeclare(declared: Any) -> None:
-    """Ends a Zenoh declaration; one that ended already (with its session) is left alone.
-
-    Raises `BusError` for one that does not end in `UNDECLARE_WITHIN` seconds.
-    """
+    """Ends a Zenoh declaration; one that ended already (with its session) is left alone. Raises `BusError` for one that
+    does not end in `UNDECLARE_WITHIN` seconds."""
     try:
         if not within(UNDECLARE_WITHIN, declared.undeclare, "undeclare"):
             raise BusError(f"{declared} did not end within {UNDECLARE_WITHIN:g} s")

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Self
 
 START_TOLERANCE = 1.0
 
@@ -47,10 +47,8 @@ class RunningGraph:
 
 
 def registry_folder() -> Path:
-    """Returns `$XDG_RUNTIME_DIR/dataflow`, else a folder in the temporary one; makes it on first use.
-
-    Raises `RegistryError` when it exists but is another user's, or open to others.
-    """
+    """Returns `$XDG_RUNTIME_DIR/dataflow`, else a folder in the temporary one; makes it on first use. Raises
+    `RegistryError` when it exists but is another user's, or open to others."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     return private_folder(Path(runtime) / "dataflow") if runtime else temporary_folder()
 
@@ -86,13 +84,7 @@ def register(
     running()  # clears away what others have left
     pid = os.getpid()
     entry = RunningGraph(
-        name,
-        namespace,
-        pid,
-        _born(pid),
-        tuple(endpoints),
-        started=time.time(),
-        graph=dict(graph or {}),
+        name, namespace, pid, _born(pid), tuple(endpoints), started=time.time(), graph=dict(graph or {})
     )
     path = registry_folder() / f"{pid}-{secrets.token_hex(4)}.json"
     written = path.with_suffix(".new")
@@ -167,3 +159,36 @@ def remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
+
+
+MAX_PATH: Final = 103
+"""Bytes that the path of a Unix socket may have: 107 on Linux, 103 on macOS."""
+SUFFIX: Final = ".run"
+
+
+class Reservation:
+    """`count` Zenoh endpoints of one run: Unix sockets in a folder of mode 0700, which lasts until `close`. The folder
+    lies beside the registry's files or, where that path is too long for a socket, in the temporary folder."""
+
+    def __init__(self, count: int) -> None:
+        """Makes the folder; raises `RegistryError` when it cannot be this user's alone."""
+        name = f"{os.getpid()}-{secrets.token_hex(4)}{SUFFIX}"
+        parent = registry_folder()
+        if len(os.fsencode(parent / name / str(count))) > MAX_PATH:
+            parent = temporary_folder()
+            for left in parent.glob(f"*{SUFFIX}"):
+                if is_abandoned(left):
+                    remove(left)
+        self._folder = parent / name
+        self._folder.mkdir(mode=0o700)
+        self.endpoints = tuple(f"unixsock-stream/{self._folder / str(number)}" for number in range(count))
+
+    def close(self) -> None:
+        """Removes the folder; further calls do nothing."""
+        remove(self._folder)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

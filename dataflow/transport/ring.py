@@ -100,9 +100,7 @@ class RingWriter(_End):
 
     def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
         """Writes one frame, on a numbered channel of this ring; False, and nothing, when there is no room for it now.
-
-        The reader then wakes the writer once it has taken something. Raises `RingError` for a frame that never fits.
-        """
+        The reader then wakes the writer once it has taken something. Raises `RingError` for a frame that never fits."""
         size = len(parts[0]) if len(parts) == 1 else sum(map(len, parts))
         if size > self.largest:
             raise RingError(f"a frame of {size} bytes does not fit a ring of {self.capacity} bytes")
@@ -144,9 +142,7 @@ class RingWriter(_End):
 
 class RingReader(_End):
     """The reading end. `wake` is the writer's eventfd, for when it waits for room. Skips what is there already.
-
-    `number`: one more than that of the reader before; the first is 1.
-    """
+    `number`: one more than that of the reader before; the first is 1."""
 
     def __init__(self, descriptor: int, wake: int, number: int) -> None:
         super().__init__(descriptor)

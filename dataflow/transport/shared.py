@@ -124,11 +124,8 @@ class Board:
 
 
 class PoolReader:
-    """The pools of other processes, mapped on first use.
-
-    A mapping lasts as long as a link's board or a view of a message refers to it: one whose producer was replaced goes
-    with the last message from it.
-    """
+    """The pools of other processes, mapped on first use. A mapping lasts as long as a link's board or a view of a
+    message refers to it: one whose producer was replaced goes with the last message from it."""
 
     def __init__(self) -> None:
         self._pools: weakref.WeakValueDictionary[str, mmap.mmap] = weakref.WeakValueDictionary()

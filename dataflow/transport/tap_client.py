@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 import msgpack
@@ -55,10 +54,8 @@ class _Origin:
     skipped: int = 0
 
     def receive(self, counts: tuple[int, int], skipped: int, window: int, *, sync: bool) -> None:
-        """Notes the counts of a sample, and which messages before it never came, as far as a window back.
-
-        The process sends nothing beyond a window that was not acknowledged, so an older loss has been reported.
-        """
+        """Notes the counts of a sample, and which messages before it never came, as far as a window back. The process
+        sends nothing beyond a window that was not acknowledged, so an older loss has been reported."""
         messages = counts[0]
         end = messages + 1 if sync else messages
         while self.lost and self.lost[0] < end - window:
@@ -89,10 +86,8 @@ class TapClient:
         statics_within: float = 1.0,
         types: TypeOf = message_type,
     ) -> None:
-        """Raises `ValueError` for an expression that is none. Waits at most `statics_within` s for the statics.
-
-        `types` gives the class of a schema name, which messages are decoded as.
-        """
+        """Raises `ValueError` for an expression that is none. Waits at most `statics_within` s for the statics. `types`
+        gives the class of a schema name, which messages are decoded as."""
         self._types = types
         self.window = window or TapWindow()
         self.id = secrets.token_hex(8)
@@ -160,9 +155,7 @@ class TapClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _wants(self, stream: str) -> bool:

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 import msgpack
@@ -32,13 +31,10 @@ class _Copy:
 
     __slots__ = ("_envelope", "_payload", "size")
 
-    def __init__(self, item: Envelope | bytes) -> None:
-        if isinstance(item, Envelope):
-            self._envelope: Envelope | None = item
-            self._payload = b""
-            self.size = ENVELOPE_OVERHEAD + (item.message.nbytes() if item.message is not None else 0)
-        else:
-            self._envelope, self._payload, self.size = None, item, len(item)
+    def __init__(self, envelope: Envelope) -> None:
+        self._envelope: Envelope | None = envelope
+        self._payload = b""
+        self.size = ENVELOPE_OVERHEAD + (envelope.message.nbytes() if envelope.message is not None else 0)
 
     def payload(self) -> bytes:
         if self._envelope is not None:
@@ -128,10 +124,8 @@ class _Tap:
 
 
 class TapServer:
-    """The process's side: keeps the taps of its namespace and sends them copies of what the process publishes.
-
-    `active` is False while there is no tap: publishers look at it before they call `offer`.
-    """
+    """The process's side: keeps the taps of its namespace and sends them copies of what the process publishes. `active`
+    is False while there is no tap: publishers look at it before they call `offer`."""
 
     def __init__(self, bus: Bus, namespace: str) -> None:
         self.active = False
@@ -153,15 +147,15 @@ class TapServer:
             runtime_key(namespace, "taps", "*"), zenoh.handlers.Callback(self._on_token, indirect=False), history=True
         )
 
-    def offer(self, stream: str, item: Envelope | bytes) -> None:
-        """Makes a published message (its envelope, or its encoded bytes) available to the taps. Never waits."""
+    def offer(self, stream: str, envelope: Envelope) -> None:
+        """Makes a published message available to the taps. Never waits."""
         if not self.active:
             return
         copy: _Copy | None = None
         with self._wake:
             for tap in self._taps.values():
                 if tap.wants(stream):
-                    copy = copy or _Copy(item)
+                    copy = copy or _Copy(envelope)
                     tap.offer(stream, copy)
             if copy is not None:
                 self._wake.notify()
@@ -189,9 +183,7 @@ class TapServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # Zenoh's threads

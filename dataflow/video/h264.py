@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dataflow.video.bits import START, Bits, PacketError, VideoError, units
 from dataflow.video.picture import REORDERED, Picture
 
-SLICE, IDR, SPS, PPS = 1, 5, 7, 8
+IDR, SPS, PPS = 5, 7, 8
 _SLICES = (1, 2, 5)
 _WITH_CHROMA = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
 """Profiles whose parameter sets state the format of the chroma."""

@@ -12,6 +12,7 @@ from dataflow.messages import CameraInfo, Clusters, Diagnostics, Image, Message,
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import transform_points
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
+from operators.cloud.filtering import selected
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
 from operators.status import counted_status
@@ -116,11 +117,7 @@ class CloudColorizer(Operator):
         colors[~seen.seen] = 0
         kept = seen.seen if self.seen_only else np.ones(cloud.count, np.bool_)
         colored = cloud.replace(colors=colors)
-        if self.seen_only:
-            fields = ("points", "colors", "intensities", "rings", "time_offsets", "normals")
-            colored = colored.replace(
-                **{name: value[kept] for name in fields if (value := getattr(colored, name)) is not None}
-            )
+        colored = selected(colored, kept) if self.seen_only else colored
         counts = {"points": cloud.count, "seen": int(seen.seen.sum()), "hidden": seen.hidden,
                   "outside the image": seen.outside, "behind or not finite": seen.behind}  # fmt: skip
         self.state.counts.update(counts | {"clouds": 1, "clouds of which nothing is seen": not counts["seen"]})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, PointCloud
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param
-from operators.cloud.filtering import Voxels, finite, in_box, in_range, radius_inliers, statistical_inliers
+from operators.cloud.filtering import Voxels, finite, in_box, in_range, radius_inliers, selected, statistical_inliers
 from operators.cloud.normals import FEWEST, estimate_normals
 from operators.status import counted_status
 
 Corner = tuple[float, float, float]
+Step = Callable[[PointCloud], PointCloud]
 
 
 class CloudFilter(Operator):
@@ -70,20 +71,8 @@ class CloudFilter(Operator):
     def process(self, cloud: PointCloud) -> dict[str, Any]:
         dropped: dict[str, int] = {}
         kept = cloud
-        if not (usable := finite(kept.points)).all():
-            kept = _select(kept, usable)
-        dropped["not finite"] = cloud.count - kept.count
-        for step, chosen in (("range", self._in_range), ("box", self._in_box)):
-            before = kept.count
-            kept = _select(kept, chosen(kept.points))
-            dropped[step] = before - kept.count
-        merged = kept.count
-        if self.voxel and kept.count:
-            kept = _thinned(kept, self.voxel)
-        dropped["voxel"] = merged - kept.count
-        for step, chosen in (("statistical outlier", self._statistical), ("radius outlier", self._radius)):
-            before = kept.count
-            kept = _select(kept, chosen(kept.points))
+        for step, done in self._steps().items():
+            before, kept = kept.count, done(kept)
             dropped[step] = before - kept.count
         if self.normal_neighbours:
             normals = estimate_normals(
@@ -98,35 +87,30 @@ class CloudFilter(Operator):
         self.state.counts.update({f"dropped, {step}": count for step, count in dropped.items()})
         return {"filtered": kept, "status": _status(cloud, dropped, kept.count)}
 
-    def _in_range(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        return in_range(points, self.min_range, self.max_range)
+    def _steps(self) -> dict[str, Step]:
+        """Returns what is done to a cloud, by the name of the step, in order."""
 
-    def _in_box(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        if self.lower is None or self.upper is None:
-            return np.ones(len(points), np.bool_)
-        return in_box(points, np.array(self.lower), np.array(self.upper))
+        def keeping(chosen: Callable[[NDArray[np.float32]], NDArray[np.bool_]], *, wanted: bool = True) -> Step:
+            def done(cloud: PointCloud) -> PointCloud:
+                kept = chosen(cloud.points) if wanted else np.ones(cloud.count, np.bool_)
+                return cloud if kept.all() else selected(cloud, kept)
 
-    def _statistical(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        if not self.outlier_neighbours:
-            return np.ones(len(points), np.bool_)
-        return statistical_inliers(points, self.outlier_neighbours, self.outlier_ratio)
+            return done
 
-    def _radius(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        if not self.radius:
-            return np.ones(len(points), np.bool_)
-        return radius_inliers(points, self.radius, self.radius_neighbours)
-
-
-def _select(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:
-    """Returns the chosen points with all that is known of them."""
-    if chosen.all():
-        return cloud
-    fields = ("colors", "intensities", "rings", "time_offsets", "normals")
-    known = {name: getattr(cloud, name) for name in fields}
-    return cloud.replace(
-        points=cloud.points[chosen],
-        **{name: values[chosen] for name, values in known.items() if values is not None},
-    )
+        box = np.array(self.lower), np.array(self.upper)
+        return {
+            "not finite": keeping(finite),
+            "range": keeping(lambda points: in_range(points, self.min_range, self.max_range)),
+            "box": keeping(lambda points: in_box(points, *box), wanted=self.lower is not None),
+            "voxel": lambda cloud: _thinned(cloud, self.voxel) if self.voxel and cloud.count else cloud,
+            "statistical outlier": keeping(
+                lambda points: statistical_inliers(points, self.outlier_neighbours, self.outlier_ratio),
+                wanted=self.outlier_neighbours > 0,
+            ),
+            "radius outlier": keeping(
+                lambda points: radius_inliers(points, self.radius, self.radius_neighbours), wanted=self.radius > 0
+            ),
+        }
 
 
 def _thinned(cloud: PointCloud, size: float) -> PointCloud:

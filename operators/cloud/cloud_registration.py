@@ -13,6 +13,7 @@ from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import finite
 from operators.cloud.registration import Prepared, Registered, Settings, register
 from operators.geometry.se3 import about_fixed_axes
+from operators.status import counted_status
 
 
 class CloudRegistration(Operator):
@@ -101,12 +102,6 @@ def _status(stamp: int, found: Registered) -> Diagnostics:
         "score": found.score,
         "rmse m": found.rmse,
     }
-    return Diagnostics(
-        stamp=stamp,
-        names=("cloud_registration",),
-        messages=(f"failed: {found.reason}" if found.reason else "registered",),
-        levels=np.array([Level.WARN if found.reason else Level.OK], np.uint8),
-        keys=tuple(shares),
-        values=tuple(f"{value:.4f}" for value in shares.values()),
-        owners=np.zeros(len(shares), np.int32),
-    )
+    text, level = (f"failed: {found.reason}", Level.WARN) if found.reason else ("registered", Level.OK)
+    figures = {name: f"{value:.4f}" for name, value in shares.items()}
+    return counted_status("cloud_registration", stamp, text, level, figures)

@@ -8,16 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import (
-    Boxes3D,
-    Clusters,
-    Diagnostics,
-    FeatureVector,
-    Odometry,
-    PointCloud,
-    Pose,
-    Transforms,
-)
+from dataflow.messages import Boxes3D, Clusters, Diagnostics, FeatureVector, Odometry, PointCloud, Pose, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled

@@ -36,9 +36,7 @@ def dbscan(points: Array, reach: float | Array, core: int, weights: NDArray[np.i
     cores = np.flatnonzero(is_core)
     if not len(cores):
         return labels
-    linked = pairs[is_core[pairs].all(axis=1)]
-    graph = coo_matrix((np.ones(len(linked), np.int8), (linked[:, 0], linked[:, 1])), (count, count))
-    _, part = connected_components(graph, directed=False)
+    part = connected(pairs[is_core[pairs].all(axis=1)], count)
     labels[cores] = part[cores]
     border = np.flatnonzero(~is_core)
     if len(border):
@@ -46,6 +44,12 @@ def dbscan(points: Array, reach: float | Array, core: int, weights: NDArray[np.i
         near = distance <= reaches[border]
         labels[border[near]] = part[cores[nearest[near]]]
     return _numbered(labels)
+
+
+def connected(pairs: NDArray[np.intp], count: int) -> NDArray[np.int32]:
+    """Returns the number of the part (N,) that each of `count` things is of, linked by pairs (M, 2) of them."""
+    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _neighbours(points: Array, reach: Array) -> NDArray[np.intp]:

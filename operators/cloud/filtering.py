@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dataflow.messages import PointCloud
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FARTHEST = 1e4  # metres: no sensor of a robot sees so far, so that is no measurement
 _LIMIT = 1 << 20  # voxels along one axis on either side of the origin; three such indices fit one int64
+
+
+FIELDS = ("colors", "intensities", "rings", "time_offsets", "normals", "precise")
+"""Fields of a cloud that hold a value for each point, beside its place."""
+
+
+def selected(cloud: PointCloud, chosen: Mask, *, fields: Sequence[str] = FIELDS) -> PointCloud:
+    """Returns the chosen points (N,) with some fields of theirs, without the others and no longer in rows of pixels."""
+    known = {name: getattr(cloud, name) if name in fields else None for name in FIELDS}
+    kept = {name: None if values is None else values[chosen] for name, values in known.items()}
+    return cloud.replace(points=cloud.points[chosen], columns=None, **kept)
 
 
 def finite(points: NDArray[np.float32]) -> Mask:

@@ -13,11 +13,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from operators.cloud.clustering import level_axes
+from operators.cloud.clustering import connected, level_axes
 from operators.cloud.filtering import Voxels
 from operators.cloud.normals import estimate_normals
 
@@ -217,9 +215,7 @@ def _least_squares(scene: Scene, members: Indices, normal: Array) -> tuple[Array
 
 def _parts(points: Array, gap: float) -> NDArray[np.int32]:
     """Returns the number of the connected part of each point; points nearer than `gap` are connected."""
-    pairs = cKDTree(points).query_pairs(gap / 2, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    return connected(cKDTree(points).query_pairs(gap / 2, output_type="ndarray"), len(points))
 
 
 def _absorbed(scene: Scene, free: Mask, members: Indices, normal: Array, d: float, reach: float) -> Indices:

@@ -16,7 +16,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import Counts, In, Operator, Out, Param, Remembered, Sampled
 from operators.cloud.clustering import level_axes
-from operators.cloud.filtering import finite
+from operators.cloud.filtering import finite, selected
 from operators.cloud.gravity import standing, told, unit
 from operators.cloud.plane_search import Plane, Scene, Search, find_planes, tolerances
 from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
@@ -258,14 +258,7 @@ def _members(surfaces: list[Surface], labels: Labels) -> NDArray[np.int64]:
 def _without(cloud: PointCloud, taken: NDArray[np.bool_]) -> PointCloud:
     """Returns the finite points that are on no surface, with their colours and normals."""
     kept = finite(cloud.points) & ~taken
-    return PointCloud(
-        stamp=cloud.stamp,
-        frame=cloud.frame,
-        points=cloud.points[kept],
-        colors=None if cloud.colors is None else cloud.colors[kept],
-        intensities=None if cloud.intensities is None else cloud.intensities[kept],
-        normals=None if cloud.normals is None else cloud.normals[kept],
-    )
+    return selected(cloud, kept, fields=("colors", "intensities", "normals"))
 
 
 def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool, lost: bool) -> Diagnostics:

@@ -76,12 +76,7 @@ class Surface:
 
 
 def recognised(
-    scene: Scene,
-    planes: list[Plane],
-    rules: Rules,
-    known_floor: float | None,
-    cell: float,
-    walls: Array | None = None,
+    scene: Scene, planes: list[Plane], rules: Rules, known_floor: float | None, cell: float, walls: Array | None = None
 ) -> tuple[list[Surface], float | None]:
     """Returns the surfaces, the floor's parts as one, and the floor's height along up: as known before if none is seen.
 

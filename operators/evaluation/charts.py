@@ -62,11 +62,10 @@ def plan(title: str, tracks: Sequence[Curve], size: tuple[int, int]) -> Pixels:
     return _drawn(title, drawn, _Axes(size, (a, b), (c, d)))
 
 
-def tiled(images: Sequence[Pixels], columns: int = 2) -> Pixels:
-    """Lays images of one size beside and below each other."""
-    blank = np.full_like(images[0], 255)
-    rows = [list(images[k : k + columns]) for k in range(0, len(images), columns)]
-    return np.vstack([np.hstack(row + [blank] * (columns - len(row))) for row in rows])
+def tiled(images: Sequence[Pixels]) -> Pixels:
+    """Lays images of one size in two columns."""
+    even = [*images, *[np.full_like(images[0], 255)] * (len(images) % 2)]
+    return np.vstack([np.hstack(even[k : k + 2]) for k in range(0, len(even), 2)])
 
 
 class _Axes:

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
-from operators.association import mutually_nearest
 from operators.estimation.chi_square import quantile
-from operators.evaluation.consistency import (
-    Innovations,
-    band,
-    covariance_of,
-    innovations,
-    normalised,
-    pose_error,
-)
+from operators.evaluation.consistency import Innovations, band, covariance_of, innovations, normalised, pose_error
+from operators.evaluation.figures import Figures
+from operators.evaluation.pairing import Pairing
 
 Array = NDArray[np.float64]
 
 
-class ConsistencyMetrics(Operator):
+class ConsistencyMetrics(Figures, Operator):
     """Collects poses with covariance and the true ones, and computes the normalised estimation error squared (NEES).
 
     An honest covariance gives a mean of the degrees of freedom and 5 % above the bound. `anees` over freedom is 1 then;
@@ -47,19 +39,13 @@ class ConsistencyMetrics(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
 
     def setup(self) -> None:
-        self._stamps: list[int] = []
-        self._estimates: list[tuple[Pose | Odometry, Array]] = []
-        self._true_stamps: list[int] = []
-        self._truths: list[Pose | Odometry] = []
+        super().setup()
+        self._pairing: Pairing[tuple[Pose | Odometry, Array], Pose | Odometry] = Pairing(self.tolerance)
         self._innovations: Innovations = {}
         self._passed_over = self._truths_not_finite = 0
-        self._figures: dict[str, float | int | str] = {}
 
     def process(
-        self,
-        estimate: Pose | Odometry,
-        ground_truth: tuple[Pose | Odometry, ...],
-        status: Diagnostics | None = None,
+        self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...], status: Diagnostics | None = None
     ) -> None:
         """Raises ValueError where estimate and truth are of different frames."""
         for truth in ground_truth:
@@ -75,31 +61,22 @@ class ConsistencyMetrics(Operator):
             if not (np.isfinite(truth.position).all() and np.isfinite(truth.orientation).all()):
                 self._truths_not_finite += 1
                 continue
-            self._true_stamps.append(truth.stamp)
-            self._truths.append(truth)
+            self._pairing.add_truth(truth.stamp, truth)
         if status is not None:
             self._innovations |= innovations(status)
         covariance = covariance_of(estimate)
         if covariance is None:
             self._passed_over += 1
-            return
-        self._stamps.append(estimate.stamp)
-        self._estimates.append((estimate, covariance))
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
+        else:
+            self._pairing.add_found(estimate.stamp, (estimate, covariance))
 
     def finish(self) -> None:
         """Computes the figures."""
-        pairs = mutually_nearest(self._stamps, self._true_stamps, self.tolerance)
+        pairs = self._pairing.finish()
         self._figures = {"matched": len(pairs), "estimates without finite covariance": self._passed_over}
         if self._truths_not_finite:
             self._figures["truths not finite"] = self._truths_not_finite
-        found = []
-        for i, j in pairs:
-            estimate, covariance = self._estimates[i]
-            found.append((estimate.stamp, pose_error(estimate, self._truths[j]), covariance))
+        found = [(estimate.stamp, pose_error(estimate, truth), C) for (estimate, C), truth in pairs]
         parts = (
             {"pose": [0, 1, 5], "position": [0, 1], "heading": [5]}
             if self.planar
@@ -110,9 +87,6 @@ class ConsistencyMetrics(Operator):
         for sensor, (total, freedom) in sorted(self._innovations.items()):
             if freedom:
                 self._judge(f"{sensor}, nis", f"{sensor}, nis_band_95_percent", total, freedom)
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
 
     def _score(self, name: str, axes: list[int], pairs: list[tuple[int, Array, Array]]) -> None:
         """Scores an estimate's axes by stamp, error (6,) and covariance (6, 6) of every pair."""

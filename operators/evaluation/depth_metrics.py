@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from dataflow.messages import DepthImage
 from dataflow.operator import Batch, Duration, In, Operator, Param
+from operators.evaluation.figures import Figures
 from operators.evaluation.pairing import Pairing
 
 Depth = NDArray[np.float32]
 
 
-class DepthMetrics(Operator):
+class DepthMetrics(Figures, Operator):
     """Collects depth images and the true ones, pixel for pixel, and computes errors when the depths end.
 
     Images are paired each with the truth nearest in time within `tolerance`; images without a partner are counted and
@@ -43,10 +44,6 @@ class DepthMetrics(Operator):
             self._pairing.add_truth(true.stamp, true)
         self._pairing.add_found(depth.stamp, depth)
         self._judge(self._pairing.settle(depth.stamp - self.lateness))
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Judges the images that waited for their truth."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from dataflow.messages import Detections2D
 from dataflow.operator import Batch, Duration, In, Operator, Param
 from operators.evaluation.detection_score import ClassScore, DetectionScore, ScoredFrame, precision, recall
+from operators.evaluation.figures import Figures, check_names, check_view
 from operators.evaluation.pairing import Pairing
-from operators.evaluation.views import check_names, check_view, listed
 
 
-class DetectionMetrics(Operator):
+class DetectionMetrics(Figures, Operator):
     """Collects detections and the true objects and computes COCO's AP50 and AP50:95 when the detections end.
 
     Frames are paired after the fact, each with the truth nearest in time within `tolerance`; frames without a partner
@@ -47,14 +47,14 @@ class DetectionMetrics(Operator):
     out: str | None = Param(None, doc="JSON file for the figures and a table of the classes; its folder is made")
 
     def setup(self) -> None:
-        self._pairs: Pairing[Objects, Objects] = Pairing(self.tolerance)
+        super().setup()
+        self._pairs: Pairing[Detections2D, Detections2D] = Pairing(self.tolerance)
         self._score = DetectionScore(
             max_detections=self.max_detections, iou=self.iou, score_threshold=self.score_threshold
         )
         self._known_to: int | None = None
         self._known: set[str] = set()
         self._classes: set[str] = set()
-        self._figures: dict[str, float | int | str] = {}
 
     def process(self, detections: Detections2D, truth: tuple[Detections2D, ...]) -> None:
         """Raises ValueError where detections and truth are of different cameras or views, or only one has names."""
@@ -63,17 +63,13 @@ class DetectionMetrics(Operator):
             if detections.count and true.count:
                 check_names(detections.class_names, true.class_names)
             self._classes.update(true.class_names or true.labels())
-            self._pairs.add_truth(true.stamp, objects_of(true, self._ignored(true)))
+            self._pairs.add_truth(true.stamp, true)
         self._known.update(detections.class_names)
-        self._pairs.add_found(detections.stamp, objects_of(detections))
+        self._pairs.add_found(detections.stamp, detections)
         if truth:
             self._known_to = truth[-1].stamp
         if self._known_to is not None:  # in a live run the truth may come late
             self._take(self._pairs.settle(min(self._known_to, detections.stamp)))
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Computes the figures and writes the file."""
@@ -90,12 +86,9 @@ class DetectionMetrics(Operator):
         beyond = {name: n for name, n in self._score.detections().items() if name not in self._classes}
         if beyond:
             self._figures["detections_not_judged"] = sum(beyond.values())
-            self._figures["classes_not_in_truth"] = listed(set(beyond))
+            self._figures["classes_not_in_truth"] = ", ".join(sorted(beyond))
         if self.out is not None:
             self._write(Path(self.out).expanduser(), classes)
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
 
     def _ignored(self, truth: Detections2D) -> NDArray[np.bool_]:
         ignored = np.zeros(truth.count, np.bool_)
@@ -105,9 +98,9 @@ class DetectionMetrics(Operator):
             ignored |= truth.pixel_counts < self.min_pixels
         return ignored
 
-    def _take(self, pairs: list[tuple[Objects, Objects]]) -> None:
+    def _take(self, pairs: list[tuple[Detections2D, Detections2D]]) -> None:
         for found, truth in pairs:
-            self._score.add(_scored(found, truth))
+            self._score.add(_scored(found, truth, self._ignored(truth)))
 
     def _averages(self, classes: Mapping[str, ClassScore]) -> dict[str, float | int | str]:
         ap50 = {name: score.ap50 for name, score in classes.items() if score.ap50 is not None}
@@ -128,7 +121,7 @@ class DetectionMetrics(Operator):
         }
         unknown = set(ap50) - self._known
         if self._known and unknown:
-            figures["unknown_classes"] = listed(unknown)
+            figures["unknown_classes"] = ", ".join(sorted(unknown))
             if len(unknown) < len(ap50):
                 figures["ap50_known_classes"] = float(np.mean([ap50[name] for name in ap50 if name not in unknown]))
         return figures
@@ -151,28 +144,7 @@ def _view(message: Detections2D) -> tuple[str, int, int]:
     return message.frame, message.width, message.height
 
 
-def _scored(found: Objects, truth: Objects) -> ScoredFrame:
-    boxes = found.boxes * np.tile(truth.size / found.size, 2)
-    return ScoredFrame(truth.boxes, truth.labels, truth.ignored, boxes, found.labels, found.scores)
-
-
-@dataclass(frozen=True, eq=False)
-class Objects:
-    """Holds size (width, height) of an image, boxes (N, 4) in its pixels, class names, scores, which are ignored."""
-
-    size: NDArray[np.float64]
-    boxes: NDArray[np.float64]
-    labels: tuple[str, ...]
-    scores: NDArray[np.float32]
-    ignored: NDArray[np.bool_]
-
-
-def objects_of(message: Detections2D, ignored: NDArray[np.bool_] | None = None) -> Objects:
-    """Returns the objects of one image; `ignored`: those that do not count, none if not given."""
-    return Objects(
-        np.array([message.width, message.height], np.float64),
-        message.boxes.astype(np.float64),
-        message.labels(),
-        message.scores,
-        np.zeros(message.count, np.bool_) if ignored is None else ignored,
-    )
+def _scored(found: Detections2D, truth: Detections2D, ignored: NDArray[np.bool_]) -> ScoredFrame:
+    scale = np.tile([truth.width / found.width, truth.height / found.height], 2)
+    boxes = found.boxes.astype(np.float64) * scale
+    return ScoredFrame(truth.boxes.astype(np.float64), truth.labels(), ignored, boxes, found.labels(), found.scores)

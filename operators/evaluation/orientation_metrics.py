@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -11,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from dataflow.messages import Imu, Odometry, Pose, Transforms
 from dataflow.messages.geometry import matrix_to_quaternion, normalize, quaternion_from_yaw, quaternion_multiply
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
-from operators.association import mutually_nearest
+from operators.evaluation.figures import Figures
+from operators.evaluation.pairing import Pairing
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ def errors(difference: Array) -> tuple[Array, Array, Array]:
     return total, 2 * np.arctan2(z, w), 2 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
 
 
-class OrientationMetrics(Operator):
+class OrientationMetrics(Figures, Operator):
     """Collects estimated and true orientations and computes the RMSE of the total error, of heading and of inclination.
 
     Each estimate is paired with the truth nearest in time within `tolerance`. A truth that poses another frame of the
@@ -60,11 +60,8 @@ class OrientationMetrics(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
 
     def setup(self) -> None:
-        self._stamps: list[int] = []
-        self._estimates: list[np.ndarray] = []
-        self._true_stamps: list[int] = []
-        self._truths: list[np.ndarray] = []
-        self._figures: dict[str, float | int | str] = {}
+        super().setup()
+        self._pairing: Pairing[Array, Array] = Pairing(self.tolerance)
 
     def process(
         self,
@@ -84,28 +81,19 @@ class OrientationMetrics(Operator):
                 q = quaternion_multiply(
                     q, matrix_to_quaternion(transform_between(extrinsics, posed, truth.child_frame))
                 )
-            self._true_stamps.append(truth.stamp)
-            self._truths.append(q)
+            self._pairing.add_truth(truth.stamp, q)
         if estimate.orientation is not None:
-            self._stamps.append(estimate.stamp)
-            self._estimates.append(estimate.orientation)
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
+            self._pairing.add_found(estimate.stamp, estimate.orientation)
 
     def finish(self) -> None:
         """Computes the figures, degrees."""
-        pairs = mutually_nearest(self._stamps, self._true_stamps, self.tolerance)
-        self._figures = {"matched": len(pairs), "unmatched_truths": len(self._true_stamps) - len(pairs)}
+        pairs = self._pairing.finish()
+        self._figures = {"matched": len(pairs), "unmatched_truths": self._pairing.unmatched_truths}
         if not pairs:
             return
-        difference = differences([self._estimates[i] for i, _ in pairs], [self._truths[j] for _, j in pairs])
+        difference = differences(*zip(*pairs, strict=True))
         if self.heading == "relative":
             difference = without_mean_heading(difference)
         for name, error in zip(("total", "heading", "inclination"), errors(difference), strict=True):
             self._figures[f"{name}_rmse_deg"] = float(np.degrees(np.sqrt((error**2).mean())))
             self._figures[f"{name}_max_deg"] = float(np.degrees(error.max()))
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)

@@ -12,12 +12,12 @@ import numpy as np
 
 from dataflow.messages import SegmentationMap
 from dataflow.operator import Batch, Duration, In, Operator, Param
+from operators.evaluation.figures import Figures, check_names, check_view
 from operators.evaluation.pairing import Pairing
-from operators.evaluation.views import check_names, check_view, listed
 from operators.segmentation.score import Confusion, class_iou
 
 
-class SegmentationMetrics(Operator):
+class SegmentationMetrics(Figures, Operator):
     """Counts how pixels of each true class were classified and computes the IoU of each class when the maps end.
 
     Frames are paired each with the truth nearest in time within `tolerance`; frames without a partner are counted and
@@ -39,10 +39,10 @@ class SegmentationMetrics(Operator):
     out: str | None = Param(None, doc="JSON file for the figures and the IoU of each class; its folder is made")
 
     def setup(self) -> None:
+        super().setup()
         self._pairing: Pairing[SegmentationMap, SegmentationMap] = Pairing(self.tolerance)
         self._pixels: Counter[tuple[str, str | None]] = Counter()
         self._known: set[str] = set()
-        self._figures: dict[str, float | int | str] = {}
 
     def process(self, segmentation: SegmentationMap, truth: tuple[SegmentationMap, ...]) -> None:
         """Raises ValueError where result and truth are of different cameras or views, or only one has names."""
@@ -53,10 +53,6 @@ class SegmentationMetrics(Operator):
         self._pairing.add_found(segmentation.stamp, segmentation)
         self._known.update(segmentation.class_names)
         self._count(self._pairing.settle(segmentation.stamp - self.lateness))
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Computes the figures and writes the file."""
@@ -80,9 +76,6 @@ class SegmentationMetrics(Operator):
             written = {"figures": self._figures, "class_iou": classes}
             file.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
 
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
-
     def _count(self, pairs: list[tuple[SegmentationMap, SegmentationMap]]) -> None:
         for found, true in pairs:
             self._pixels.update(_counted(found, true))
@@ -105,7 +98,7 @@ class SegmentationMetrics(Operator):
         }
         unknown = set(classes) - self._known
         if self._known and unknown:
-            figures["unknown_classes"] = listed(unknown)
+            figures["unknown_classes"] = ", ".join(sorted(unknown))
             if len(unknown) < len(classes):
                 figures["miou_known_classes"] = float(
                     np.mean([classes[name] for name in classes if name not in unknown])

@@ -11,11 +11,12 @@ from scipy.spatial import cKDTree
 
 from dataflow.messages import Mesh, PointCloud
 from dataflow.operator import In, Operator, Param, Sampled
+from operators.evaluation.figures import Figures
 
 Array = NDArray[np.float64]
 
 
-class SurfaceMetrics(Operator):
+class SurfaceMetrics(Figures, Operator):
     """Scores the last cloud or mesh of a stream against the true surface: accuracy, completeness and F-score.
 
     A mesh counts as points that are drawn evenly from it. All of the true surface counts, whether a sensor has come by
@@ -31,8 +32,8 @@ class SurfaceMetrics(Operator):
     points: int = Param(50_000, ge=100, le=5_000_000, doc="points that are drawn from a mesh")
 
     def setup(self) -> None:
+        super().setup()
         self._last: tuple[PointCloud | Mesh, Mesh | PointCloud] | None = None
-        self._figures: dict[str, float | int | str] = {}
         self._count = 0
 
     def process(self, surface: PointCloud | Mesh, truth: Mesh | PointCloud) -> None:
@@ -41,10 +42,6 @@ class SurfaceMetrics(Operator):
             raise ValueError(f"the surface is in frame {surface.frame!r}, the true one in {truth.frame!r}")
         self._last = surface, truth
         self._count += 1
-
-    def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew, and so does the score."""
-        self.setup()
 
     def finish(self) -> None:
         """Scores the last surface."""

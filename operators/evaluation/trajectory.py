@@ -165,16 +165,16 @@ def relative_errors(matches: Matches, seconds: float, metres: float) -> dict[str
     return figures
 
 
-def segment_drift(matches: Matches, lengths: Sequence[float], step: int = 10) -> dict[str, float]:
+def segment_drift(matches: Matches, lengths: Sequence[float]) -> dict[str, float]:
     """Drift as KITTI defines it (Geiger et al., CVPR 2012): mean error of segments of the true path by their length.
 
-    `drift_percent` and `drift_deg_per_m` over all segments of the given lengths (m) that begin at every `step`th pose;
+    `drift_percent` and `drift_deg_per_m` over all segments of the given lengths (m) that begin at every tenth pose;
     `drift_segments` is their number. Empty where the path is shorter than all of them.
     """
     steps = np.linalg.norm(np.diff(np.array(matches.truth.positions).reshape(-1, 3), axis=0), axis=1)
     travelled = np.concatenate(([0.0], np.cumsum(steps)))
     first, second, spans = [], [], []
-    for i in range(0, len(matches.truth), step):
+    for i in range(0, len(matches.truth), 10):
         for length in lengths:
             j = int(np.searchsorted(travelled, travelled[i] + length, side="right"))
             if j < len(matches.truth):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from dataflow.messages import Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param
+from operators.evaluation.figures import Figures
 from operators.evaluation.trajectory import (
     PoseLog,
     Trajectory,
@@ -23,7 +23,7 @@ from operators.evaluation.trajectory import (
 )
 
 
-class TrajectoryMetrics(Operator):
+class TrajectoryMetrics(Figures, Operator):
     """Collects an estimated and a true trajectory and computes ATE and RPE when the estimate ends.
 
     Both must pose the same child frame; the frames they are expressed in may differ, which the alignment makes up for.
@@ -51,9 +51,9 @@ class TrajectoryMetrics(Operator):
     out: str | None = Param(None, doc="folder for estimate.tum, ground_truth.tum and metrics.json; made if missing")
 
     def setup(self) -> None:
+        super().setup()
         self._estimate, self._truth = PoseLog(), PoseLog()
         self._not_finite = self._truths_not_finite = 0
-        self._figures: dict[str, float | int | str] = {}
 
     def process(self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
         """Raises ValueError where estimate and truth pose different child frames."""
@@ -72,10 +72,6 @@ class TrajectoryMetrics(Operator):
             self._estimate.append(estimate.stamp, estimate.position, estimate.orientation)
         else:
             self._not_finite += 1
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Computes the figures and writes the files."""
@@ -101,9 +97,6 @@ class TrajectoryMetrics(Operator):
         self._figures |= segment_drift(matches, self.drift_metres)
         if self.out is not None:
             self._write(Path(self.out).expanduser(), estimate, truth)
-
-    def summary(self) -> Mapping[str, float | int | str]:
-        return dict(self._figures)
 
     def _write(self, folder: Path, estimate: Trajectory, truth: Trajectory) -> None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -16,12 +16,13 @@ from dataflow.operator import Batch, Duration, In, Operator, Out, Param, Sampled
 from operators.estimation.chi_square import quantile
 from operators.evaluation.charts import Curve, chart, plan, tiled
 from operators.evaluation.consistency import Innovations, covariance_of, innovations, normalised, pose_error
+from operators.evaluation.figures import Figures
 
 Array = NDArray[np.float64]
 _PARTS = {"position": (0, 1, 2), "orientation": (3, 4, 5)}
 
 
-class TrajectoryPlots(Operator):
+class TrajectoryPlots(Figures, Operator):
     """Gives the error of every pose against the truth as curves, and a picture of all so far every `period`.
 
     The picture holds the tracks from above, the error of the position beside three of its standard deviations, the
@@ -61,10 +62,7 @@ class TrajectoryPlots(Operator):
         self._unpaired = 0
 
     def process(
-        self,
-        estimate: Pose | Odometry,
-        ground_truth: tuple[Pose | Odometry, ...],
-        status: Diagnostics | None = None,
+        self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...], status: Diagnostics | None = None
     ) -> Mapping[str, Any]:
         """Raises ValueError where estimate and truth pose different child frames."""
         if ground_truth:
@@ -89,10 +87,6 @@ class TrajectoryPlots(Operator):
             self._shown = estimate.stamp
             made["picture"] = Image(stamp=estimate.stamp, frame="plots", data=self._drawn())
         return made
-
-    def on_reset(self, input: str) -> None:
-        """A clock jumped back: the curves begin anew."""
-        self.setup()
 
     def finish(self) -> None:
         """Writes the picture of everything."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dataflow.operator import Remembered
+from operators.fusion.filter.error_state_filter import TOO_LATE
 from operators.fusion.filter.gate import GateConfig, Health
-from operators.fusion.filter.late_filter import TOO_LATE
 from operators.fusion.sensors.settings import never_yields
 
 _ANY = GateConfig()

@@ -27,12 +27,12 @@ from dataflow.messages import (
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.alarms import Alarms
-from operators.fusion.filter.control import Command
 from operators.fusion.filter.error_state import Noise
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.gate import GateConfig
+from operators.fusion.filter.history import Command
 from operators.fusion.filter.imu_dropout import ImuDropout
 from operators.fusion.filter.initialisation import COASTING, Prior, coasting_node, prior_of
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement
 from operators.fusion.filter.suspicions import LATE
 from operators.fusion.output import (
@@ -68,7 +68,7 @@ class State:
     lever_arms: LeverArms
     origin: tuple[float, float, float] | None
     strict: set[str] = field(default_factory=set)  # before the filter, which is made anew with their gates
-    filter: LateFilter | None = None
+    filter: ErrorStateFilter | None = None
     alarms: Alarms = field(default_factory=Alarms)
     last: LastMeasurements = field(default_factory=LastMeasurements)
     sure: bool = False
@@ -170,8 +170,8 @@ class EkfFusion(Operator):
             origin=self.origin,
         )
 
-    def new_part(self, kind: type[Any]) -> LateFilter:
-        return LateFilter(self._config(), coasting_node(0, self._prior(), self.gravity))
+    def new_part(self, kind: type[Any]) -> ErrorStateFilter:
+        return ErrorStateFilter(self._config(), coasting_node(0, self._prior(), self.gravity))
 
     def process(
         self,
@@ -210,6 +210,11 @@ class EkfFusion(Operator):
         health = {} if fused is None else fused.health
         ignored = self.state.ignored + (Counter() if fused is None else fused.ignored)
         return figures(health, self._offsets(), dict(self._unheard()), ignored)
+
+    @property
+    def _filter(self) -> ErrorStateFilter:
+        assert self.state.filter is not None
+        return self.state.filter
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Returns whether a message comes after the sensor's last; one that does not is counted."""
@@ -250,10 +255,9 @@ class EkfFusion(Operator):
 
     def _bridge(self, stamp: int) -> bool:
         """Takes the inertial sensor's place where it is silent; False where it is not."""
-        assert self.state.filter is not None
         if not self.state.dropout.lasts(stamp):
             return False
-        self.state.filter.feel(self.state.dropout.sample(stamp, self.state.filter.estimate(stamp)[0]))
+        self._filter.feel(self.state.dropout.sample(stamp, self._filter.estimate(stamp)[0]))
         return True
 
     def _prior(self) -> Prior:
@@ -289,13 +293,14 @@ class EkfFusion(Operator):
         )
         if begun is None:
             return False
-        self.state.filter = LateFilter(self._config(), begun[0])
+        self.state.filter = ErrorStateFilter(self._config(), begun[0])
         self.state.ignored["begun in motion"] += int(not begun[1])
         return True
 
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
         if self.state.filter is None and self.motion == "constant_velocity":
-            self.state.filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
+            start = coasting_node(message.stamp, self._prior(), self.gravity)
+            self.state.filter = ErrorStateFilter(self._config(), start)
         settings = self._settings(name)
         if never_yields(gate := settings.gate(use_of(name, message, settings))):  # by the setting, or by its type
             self.state.strict.add(name)
@@ -324,20 +329,17 @@ class EkfFusion(Operator):
 
     def _clock(self, name: str) -> tuple[int, int]:
         """Returns a sensor's clock in the filter, -1 for none, and the offset (ns) that it is believed to have."""
-        assert self.state.filter is not None
-        offsets = self.state.filter.offsets()
+        offsets = self._filter.offsets()
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
 
     def _late(self, sensor: str) -> int:
         """Returns by how much (ns) a sensor's stamps are found to be late, without being told."""
-        assert self.state.filter is not None
-        found = self.state.filter.suspicion
+        found = self._filter.suspicion
         if found is None or found[:2] != (sensor, LATE) or abs(found[2]) >= self.window:
             return 0
         return round(found[2] * 1e9)
 
     def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
-        assert self.state.filter is not None
         assert isinstance(message, Twist)
         if self.motion == "inertial":
             self.state.ignored[f"{name}: a control input beside inertial samples"] += 1
@@ -346,33 +348,31 @@ class EkfFusion(Operator):
         else:
             turn = around.place(message.frame)[:3, :3]
             time = message.stamp - round(settings.offset * 1e9)
-            self.state.filter.command(Command(time, turn @ message.linear, turn @ message.angular, settings.lag))
+            self._filter.command(Command(time, turn @ message.linear, turn @ message.angular, settings.lag))
 
     def _odometry(self, stamp: int) -> Odometry | None:
-        assert self.state.filter is not None
-        state, rate = self.state.filter.estimate(stamp)
+        state, rate = self._filter.estimate(stamp)
         self.state.sure = self.state.sure or well_known(state.covariance, self.sure)
         if not self.state.sure:
             return None
-        found = self.state.filter.suspicion
+        found = self._filter.suspicion
         if found is not None and found[1] == LATE:
             state = unsure_of_time(state, rate, math.hypot(found[2] - 1e-9 * self._late(found[0]), found[3]))
         T_body_base = self.state.lever_arms.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 
     def _status(self, stamp: int) -> Diagnostics | None:
-        assert self.state.filter is not None
-        health, ignored = self.state.filter.health, self.state.ignored + self.state.filter.ignored
+        health, ignored = self._filter.health, self.state.ignored + self._filter.ignored
         others = {}
-        if (count := self.state.filter.hypotheses) > 1:
+        if (count := self._filter.hypotheses) > 1:
             others["filter"] = f"{count} headings in question"
-        if self.state.filter.doubted_heading:
+        if self._filter.doubted_heading:
             others["heading"] = "the first heading that was told may be wrong: others explain as much"
-        if self.state.filter.refuted_heading:
+        if self._filter.refuted_heading:
             others["heading"] = "the first heading that was told is wrong: measurements contradict it"
-        if stamp - self.state.filter.restarted < _ANEW:
+        if stamp - self._filter.restarted < _ANEW:
             others["filter"] = "begun anew: what was felt and measured of late contradicts the rotation"
-        if (found := self.state.filter.suspicion) is not None:
+        if (found := self._filter.suspicion) is not None:
             others |= suspicion_of(*found)
         if self._lies():
             others["level"] = (
@@ -380,18 +380,17 @@ class EkfFusion(Operator):
             )
         if self.state.dropout.lasts(stamp):
             others["inertial sensor"] = "silent: the motion is bridged by what others see"
-        if (warnings := self.state.alarms.due(stamp, health, self.state.filter.ignored, self._gates, others)) is None:
+        if (warnings := self.state.alarms.due(stamp, health, self._filter.ignored, self._gates, others)) is None:
             return None
         warnings |= {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
-        warnings |= unmeasured(self.state.filter.estimate(stamp)[0].covariance)
+        warnings |= unmeasured(self._filter.estimate(stamp)[0].covariance)
         return diagnostics(stamp, health, ignored, self._offsets(), warnings)
 
     def _lies(self) -> bool:
         """Returns whether a base on wheels is tilted by more than a slope may be, 60 degrees."""
-        assert self.state.filter is not None
         if self.slip is None and all(s.use != "wheels" for s in self.sensors.values()):
             return False
-        R_world_body = self.state.filter.estimate(self.state.filter.time)[0].rotation
+        R_world_body = self._filter.estimate(self._filter.time)[0].rotation
         return bool((R_world_body @ self.state.lever_arms.of(self.base_frame)[:3, :3])[2, 2] < 0.5)
 
     def _unheard(self) -> list[tuple[str, str]]:

@@ -9,13 +9,84 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from vqf import VQF
 
 from dataflow.messages import Diagnostics, Imu, MagneticField
-from dataflow.operator import KEPT, In, Operator, Out, Param, Sampled
-from operators.fusion.orientation import Orientation, OrientationConfig
+from dataflow.operator import KEPT, In, Operator, Out, Param, Remembered, Sampled
 
 Array = NDArray[np.float64]
 _WARM_UP = 16
+
+
+class Orientation(Remembered):
+    """Takes samples with stamps (ns). vqf wants them equally spaced, so steps are divided into whole periods.
+
+    A step of n periods is made of n samples on the straight line from the last reading to the new one; what it is
+    longer or shorter than n periods scales their angular velocity, so that the angle turned is right.
+    """
+
+    stamp: int
+    fields: int
+    _period: float
+    _last: tuple[Array, Array] | None
+    _vqf_state: dict[str, Any]
+
+    def __init__(
+        self, period: float, tau_acc: float = 3.0, tau_mag: float = 9.0, field_rate: float | None = None
+    ) -> None:
+        """`period`: seconds between samples; the rest as the operator's parameters."""
+        self._period, self._taus, self._field_rate = period, (tau_acc, tau_mag), field_rate
+        self._last, self.stamp, self.fields, self._vqf_state = None, -1, 0, {}
+        self.restored()
+
+    def prepare_snapshot(self) -> None:
+        self._vqf_state = self._vqf.state
+
+    def restored(self) -> None:
+        field_period = self._period if self._field_rate is None else 1 / self._field_rate
+        self._vqf = VQF(self._period, magTs=field_period, tauAcc=self._taus[0], tauMag=self._taus[1])
+        kinds = self._vqf.state
+        if self._vqf_state:
+            self._vqf.state = {name: type(kinds[name])(_plain(value)) for name, value in self._vqf_state.items()}
+
+    def feel(self, stamp: int, gyro: Array, accel: Array) -> None:
+        """Takes angular velocity (rad/s) and specific force (m/s²); the stamp is later than the last."""
+        if self._last is None:
+            self._vqf.updateGyr(gyro)
+            self._vqf.updateAcc(accel)
+        else:
+            span = (stamp - self.stamp) * 1e-9
+            steps = max(1, round(span / self._period))
+            scale = span / (steps * self._period)
+            before_gyro, before_accel = self._last
+            for k in range(1, steps + 1):
+                share = k / steps
+                self._vqf.updateGyr(np.ascontiguousarray((before_gyro + share * (gyro - before_gyro)) * scale))
+                self._vqf.updateAcc(np.ascontiguousarray(before_accel + share * (accel - before_accel)))
+        self._last, self.stamp = (np.array(gyro), np.array(accel)), stamp
+
+    def see(self, field: Array) -> None:
+        """Takes a magnetic field, of the stamp of the last sample and in any unit."""
+        self._vqf.updateMag(np.array(field))
+        self.fields += 1
+
+    def orientation(self, *, magnetic: bool) -> Array:
+        """The quaternion (x, y, z, w) that maps the sensor to east-north-up; if not magnetic, with any heading."""
+        q = self._vqf.getQuat9D() if magnetic else self._vqf.getQuat6D()
+        return np.roll(q, -1)
+
+    @property
+    def at_rest(self) -> bool:
+        return bool(self._vqf.getRestDetected())
+
+    @property
+    def disturbed(self) -> bool:
+        """The magnetic field is not that of the earth as known so far."""
+        return bool(self._vqf.getMagDistDetected())
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 @dataclass
@@ -65,7 +136,7 @@ class OrientationFilter(Operator):
     state: State
 
     def new_part(self, kind: type[Any]) -> Orientation:
-        return Orientation(self._config(), 1.0)  # it restores the period
+        return self._made(1.0)  # it restores the period
 
     def process(self, imu: Imu, magnetic_field: MagneticField | None = None) -> dict[str, Any] | None:
         """Raises ValueError where the magnetic field is in another frame."""
@@ -104,8 +175,8 @@ class OrientationFilter(Operator):
         figures: dict[str, float | int | str] = {"samples": self.state.samples, "at rest": self.state.rested}
         return figures | {f"ignored, {reason}": count for reason, count in sorted(self.state.ignored.items())}
 
-    def _config(self) -> OrientationConfig:
-        return OrientationConfig(self.tau_acc, self.tau_mag, self.field_rate)
+    def _made(self, period: float) -> Orientation:
+        return Orientation(period, self.tau_acc, self.tau_mag, self.field_rate)
 
     def _new_field(self, imu: Imu, field: MagneticField | None) -> np.ndarray | None:
         """The field (3,) where it is one that was not used before, and usable."""
@@ -128,7 +199,7 @@ class OrientationFilter(Operator):
         if len(self.state.waiting) < _WARM_UP:
             return False
         stamps = [stamp for stamp, _, _ in self.state.waiting]
-        self.state.filter = Orientation(self._config(), float(np.median(np.diff(stamps))) * 1e-9)
+        self.state.filter = self._made(float(np.median(np.diff(stamps))) * 1e-9)
         for stamp, gyro, accel in self.state.waiting:
             self.state.filter.feel(stamp, gyro, accel)
         self.state.waiting = []

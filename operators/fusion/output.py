@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Odometry
 from dataflow.messages.diagnostics import Level
 from operators.fusion.filter.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
-from operators.fusion.filter.far import UNMEASURED
+from operators.fusion.filter.error_state_filter import UNMEASURED
 from operators.fusion.filter.gate import Health
 from operators.fusion.filter.suspicions import LATE
 from operators.geometry.se3 import skew

@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from dataflow.operator import Operator
+
 Role = Literal["agent", "person", "rolls", "seat", "container", "portable", "support", "drink", "goal"]
 
 ROLES: Mapping[Role, str] = {
@@ -119,6 +121,16 @@ class LabelSpace:
     def unknown(self, labels: Iterable[str]) -> list[str]:
         """Returns the classes that have no entry."""
         return [label for label in labels if _key(label) not in self._entries]
+
+
+def warn_of_unknown(operator: Operator, labels: LabelSpace, classes: Iterable[str]) -> int:
+    """Returns how many classes of a network have no entry, after one warning of an operator that names them."""
+    unknown = labels.unknown(classes)
+    if unknown:
+        names = ", ".join(map(repr, unknown))
+        text = "the label space %s has no entry for %s: they have no roles and no usual size; `labels` names another"
+        operator.log.warning(text, labels.name, names)
+    return len(unknown)
 
 
 def labels_file(given: str) -> str:

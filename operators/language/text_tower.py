@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.inference import ModelError, Provider, open_session
+from operators.inference import ModelError, open_session
 from operators.language.bpe import LENGTH, Tokenizer
 from operators.language.image_tower import unit_rows, vector_output
 
@@ -22,9 +22,9 @@ class TextTower:
     Raises FileNotFoundError, or ModelError for a network of other inputs or outputs, or a tokenizer that is none.
     """
 
-    def __init__(self, file: Path, tokenizer: Path, provider: Provider = "cpu") -> None:
+    def __init__(self, file: Path, tokenizer: Path) -> None:
         self._tokenizer = Tokenizer(tokenizer)
-        self._session = open_session(file, provider)
+        self._session = open_session(file, "cpu")
         self._inputs = sorted(self._session.get_inputs(), key=lambda each: "mask" in each.name)  # stable
         fits = 1 <= len(self._inputs) <= 2 and all(i.type in _TYPES and len(i.shape) == 2 for i in self._inputs)
         if not fits:

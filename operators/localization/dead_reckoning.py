@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Imu, Odometry
+from dataflow.messages import Odometry
 from dataflow.messages.geometry import yaw_of
 from dataflow.operator import Remembered
 from operators.estimation.particles import wrapped
@@ -79,8 +79,3 @@ class DeadReckoning(Remembered):
         within = [rate for stamp, rate in self._rates if begin < stamp <= end]
         self._rates = [(stamp, rate) for stamp, rate in self._rates if stamp > end]
         return sum(within) / len(within) if within else None
-
-
-def vertical_rate(imu: Imu, T_base_imu: Array) -> float:
-    """Returns the turning rate about the robot's z axis, rad/s."""
-    return float(T_base_imu[2, :3] @ imu.angular_velocity)

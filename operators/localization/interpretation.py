@@ -170,6 +170,7 @@ def cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
         raise ValueError("sightings need positions, or ranges and bearings: one of the two does not say where it is")
     r, b = sightings.ranges, sightings.bearings
     e = np.zeros(N) if sightings.elevations is None else sightings.elevations
+    r, b, e = (np.where(np.isfinite(one), one, np.nan) for one in (r, b, e))
     polar = np.zeros((N, 3, 3))
     polar[:, 2, 2] = np.maximum(1e-4, 1.0 / np.maximum(r, 0.1) ** 2) if sightings.elevations is None else 0.0
     size = sightings.covariances.shape[1]

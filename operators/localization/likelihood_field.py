@@ -60,12 +60,11 @@ class LikelihoodField:
     def score(self, poses: Array, points: Array, *, broad: bool = False) -> Array:
         """Returns the mean logarithm of the likelihood (N,) of points (M, 2), seen from poses (N, 3)."""
         table = self._broad if broad else self._sharp
-        cells = self._cells(poses, points)
-        return np.asarray(table[cells].mean(axis=1, dtype=np.float64))
+        return np.asarray(table[self._indices(poses, points)].mean(axis=1, dtype=np.float64))
 
     def distances(self, pose: Array, points: Array) -> Array:
         """Returns how far (M,) points seen from a pose (3,) are from the nearest taken cell, metres."""
-        return np.asarray(self._distance.reshape(-1)[self._cells(pose[None], points)[0]], np.float64)
+        return np.asarray(self._distance.reshape(-1)[self._indices(pose[None], points)[0]], np.float64)
 
     def places(self, count: int, rng: np.random.Generator) -> Array:
         """Draws poses (count, 3) evenly from the free cells and all headings."""
@@ -74,7 +73,7 @@ class LikelihoodField:
         place = cells * self.resolution @ np.array([[c, s], [-s, c]]) + self._origin
         return np.column_stack([place, rng.uniform(-math.pi, math.pi, count)])
 
-    def _cells(self, poses: Array, points: Array) -> NDArray[np.int32]:
+    def _indices(self, poses: Array, points: Array) -> NDArray[np.int32]:
         """Indices (N, M) into the padded grid; what lies outside of it falls on its rim."""
         c, s = math.cos(self._yaw), math.sin(self._yaw)
         place = ((poses[:, :2] - self._origin) @ np.array([[c, -s], [s, c]]) / self.resolution + self._margin).astype(

@@ -31,15 +31,15 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
-from operators.localization.dead_reckoning import DeadReckoning, vertical_rate
-from operators.localization.estimate import Estimate, apart, flat, planar
+from operators.geometry.planar import flat, placed_in, planar
+from operators.localization.dead_reckoning import DeadReckoning
 from operators.localization.interpretation import MODALITIES, Surroundings, Unusable, observation
 from operators.localization.likelihood_field import LikelihoodField
 from operators.localization.map_file import read_map
 from operators.localization.motion import DriveNoise
 from operators.localization.particle_filter import CloudConfig
 from operators.localization.sensor_weights import CONSISTENT
-from operators.localization.weighted_cloud import WeightedCloud
+from operators.localization.weighted_cloud import Estimate, WeightedCloud, contradict
 from operators.status import Row, status_of_rows
 
 _LEVELS = {
@@ -85,7 +85,7 @@ def status_of(
     for name, vote in modalities.items():
         if vote.begun:
             own = vote.estimate()
-            off = apart(own, fused)
+            off = contradict(own, fused)
             text = "contradicts the fused estimate" if off else own.word
             places = {"pose": written(own.mean)} | ({} if own.other is None else {"other place": written(own.other)})
             rows.append((f"{name} alone", text, Level.WARN if off else Level.OK, places))
@@ -205,7 +205,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
         for name, message in sorted(measurements.items()):
             if isinstance(message, Imu):
                 T = transform_between(extrinsics, message.frame, self.base_frame)
-                rate = vertical_rate(message, T)
+                rate = float(T[2, :3] @ message.angular_velocity)  # about the robot's z axis
                 if math.isfinite(rate):
                     self.state.reckoning.feel(message.stamp, rate)
                 else:
@@ -295,7 +295,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
         if fused.word == "localised":
             result["pose"] = self._odometry(fused, odometry)
             result["correction"] = Transforms.from_matrix(
-                planar(fused.mean) @ invert(flat(odometry)),
+                planar(*fused.mean) @ invert(flat(odometry)),
                 stamp=stamp,
                 frame=self.map_frame,
                 child_frame=odometry.frame,
@@ -315,14 +315,5 @@ class ParticleFilterLocalizer(Operator, merge=True):
         return result
 
     def _odometry(self, estimate: Estimate, odometry: Odometry) -> Odometry:
-        covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
-        covariance[np.ix_([0, 1, 5], [0, 1, 5])] = estimate.covariance
-        return Odometry.from_matrix(
-            planar(estimate.mean),
-            stamp=odometry.stamp,
-            frame=self.map_frame,
-            child_frame=self.base_frame,
-            linear=odometry.linear,
-            angular=odometry.angular,
-            pose_covariance=covariance,
-        )
+        T = planar(*estimate.mean)
+        return placed_in(self.map_frame, self.base_frame, T, estimate.covariance, odometry)

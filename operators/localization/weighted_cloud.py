@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.operator import Remembered
+from operators.estimation.particles import wrapped
 from operators.localization.competing_hypothesis import CompetingHypothesis
-from operators.localization.estimate import Estimate
 from operators.localization.observations import Observation
 from operators.localization.particle_filter import DOUBTFUL, CloudConfig, ParticleFilter
 from operators.localization.sensor_weights import SensorWeights
@@ -19,6 +20,33 @@ _WIDE, _TURNED, _MOST = 0.3, 0.15, 0.6
 """Localised: spread in m and rad below the first two, and more than the last of the weight in one place."""
 _LOST = 0.25
 """Doubt above which the robot is lost."""
+Word = Literal["waiting", "searching", "ambiguous", "localised", "lost"]
+_APART = 16.27
+"""Chi-square with 3 degrees of freedom, 99.9 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A pose (3,) with covariance (3, 3), the share of the weight that it has, and whether it is to be believed.
+
+    `other`: another place (3,) that explains what was observed about as well.
+    """
+
+    word: Word
+    mean: Array
+    covariance: Array
+    share: float
+    other: Array | None = None
+
+
+def contradict(first: Estimate, second: Estimate) -> bool:
+    """Returns whether two estimates, both to be believed, contradict each other."""
+    if first.word != "localised" or second.word != "localised":
+        return False
+    off = first.mean - second.mean
+    off[2:] = wrapped(off[2:])
+    spread = first.covariance + second.covariance + np.diag([0.03**2, 0.03**2, 0.02**2])
+    return float(off @ np.linalg.solve(spread, off)) > _APART
 
 
 class WeightedCloud(Remembered):

@@ -21,6 +21,7 @@ _NEAR, _FAR = 0.4, 6.0  # metres
 _REACH = 0.2  # a return farther from the surface than this share of the depth is of another one
 _KNEE, _NOISE = 0.1, 0.02  # metres: beyond the knee a residual counts linearly; standard deviation of a residual
 _ALIKE = 30  # returns whose errors are alike
+_KEEP = 0.9  # share of the information that is kept at every pair
 _FEWEST = 30  # returns on surfaces that a pair must have
 _PRIOR = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 0.1])  # m, rad, share: standard deviations before anything is seen
 
@@ -53,8 +54,8 @@ class Misfit:
 class DepthScanAgreement(Remembered):
     """Follows, pair by pair, the misfit of depth images and scans by point-to-plane alignment with forgetting.
 
-    Each pair is aligned from where the last ones led, and its information is added to theirs, whose weight falls by
-    `keep`. Directions that the surfaces do not constrain stay at zero, within a prior. Method: projective association
+    Each pair is aligned from where the last ones led, and its information is added to theirs, whose weight falls.
+    Directions that the surfaces do not constrain stay at zero, within a prior. Method: projective association
     as in Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995, with the scale as
     one more unknown.
     """
@@ -63,8 +64,7 @@ class DepthScanAgreement(Remembered):
     _information: Array
     pairs: int
 
-    def __init__(self, keep: float = 0.9) -> None:
-        self._keep = keep
+    def __init__(self) -> None:
         self._x = np.zeros(7)
         self._information = np.zeros((7, 7))
         self.pairs = 0
@@ -74,7 +74,7 @@ class DepthScanAgreement(Remembered):
 
         False where they share too few surfaces.
         """
-        self._information *= self._keep
+        self._information *= _KEEP
         T = se3.exp(self._x[:6]) @ T_depth_lidar
         found = _residuals(depth, 1.0 + self._x[6], K, points @ T[:3, :3].T + T[:3, 3])
         if found is None:

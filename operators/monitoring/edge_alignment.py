@@ -17,6 +17,7 @@ _JUMP = 0.08  # share of the depth by which neighbours on an edge differ
 _STEEPEST = 100.0  # grey levels: steeper edges count no more than such
 _MARGIN = 0.05  # share by which the better explanation fits better, from which it is stated
 _LAYERS = 3
+_REACH, _KEEP = 16, 0.9  # working pixels up to which edges are shifted; share kept at every image
 _BLUR = 1.0  # working pixels
 _HALVES = ("left half", "right half")
 
@@ -68,7 +69,7 @@ class Correction:
 
 
 class EdgeAlignment(Remembered):
-    """Adds up, image by image and forgetting by `keep`, how well the edges fit at every shift up to `reach` pixels.
+    """Adds up, image by image and forgetting, how well the edges fit at every shift up to a reach.
 
     The two halves of the image are kept apart: a turn about the optical axis moves them against each other. So are near
     edges and far ones: a camera that is turned moves all alike, one that is displaced near ones more. Working
@@ -80,12 +81,9 @@ class EdgeAlignment(Remembered):
     _edges: Array
     _nearness: Array
 
-    def __init__(self, reach: int = 16, keep: float = 0.9) -> None:
-        self._reach, self._keep = reach, keep
-        side = 2 * reach + 1
-        self._sums = np.zeros(
-            (_LAYERS, 2, side, side), np.float64
-        )  # near edges to far ones, in the left half and the right
+    def __init__(self) -> None:
+        side = 2 * _REACH + 1
+        self._sums = np.zeros((_LAYERS, 2, side, side))  # near edges to far ones, in the left half and the right
         self._edges = np.zeros((_LAYERS, 2))
         self._nearness = np.zeros((_LAYERS, 2))  # sums of 1 / distance, and of edges, of near ones to far ones
 
@@ -97,10 +95,9 @@ class EdgeAlignment(Remembered):
         slope = cv2.magnitude(cv2.Sobel(half, cv2.CV_32F, 1, 0), cv2.Sobel(half, cv2.CV_32F, 0, 1))
         slope = np.minimum(slope, np.float32(_STEEPEST))
         height, width = half.shape
-        r, middle = self._reach, width // 2
-        self._sums *= self._keep
-        self._edges *= self._keep
-        self._nearness *= self._keep
+        r, middle = _REACH, width // 2
+        for sums in (self._sums, self._edges, self._nearness):
+            sums *= _KEEP
         for layer, own in enumerate(np.array_split(rims[np.argsort(rims[:, 2], kind="stable")], _LAYERS)):
             drawn = _drawn(own, K, half.shape)
             ahead = own[own[:, 2] > 0.1, 2]
@@ -116,7 +113,7 @@ class EdgeAlignment(Remembered):
         sums, counts = self._sums.sum(axis=0), self._edges.sum(axis=0)
         parts = [("image", sums.sum(axis=0), float(counts.sum()))]
         parts += [(name, s, float(n)) for name, s, n in zip(_HALVES, sums, counts.tolist(), strict=True)]
-        return [_best(name, surface, edges, self._reach) for name, surface, edges in parts if surface.max() > 0]
+        return [_best(name, surface, edges) for name, surface, edges in parts if surface.max() > 0]
 
     def correction(self, K: Array) -> Correction | None:
         """Returns what makes the edges fit a camera with K best; None before there are near edges and far ones."""
@@ -125,10 +122,10 @@ class EdgeAlignment(Remembered):
             return None
         nearness = self._nearness[:, 0] / self._nearness[:, 1]
         layers = [cv2.GaussianBlur(layer, (0, 0), _BLUR) for layer in layers]  # else values in between were lower ones
-        shifts = np.arange(-self._reach, self._reach + 0.25, 0.5)  # of the near ones, working pixels
+        shifts = np.arange(-_REACH, _REACH + 0.25, 0.5)  # of the near ones, working pixels
         x, y = (each.ravel() for each in np.meshgrid(shifts, shifts))
         turned, displaced = (
-            np.sum([_sampled(a, x * far, y * far, self._reach) for a, far in zip(layers, scales, strict=True)], axis=0)
+            np.sum([_sampled(a, x * far, y * far) for a, far in zip(layers, scales, strict=True)], axis=0)
             for scales in (np.ones(_LAYERS), nearness / nearness[0])
         )
         focal = K[0, 0] / 2
@@ -168,15 +165,14 @@ def _drawn(points: Array, K: Array, shape: tuple[int, ...]) -> Surface:
     return drawn
 
 
-def _sampled(surface: Array, x: Array, y: Array, reach: int) -> Array:
-    """Returns the values of a surface (S, S) at shifts (N,) up to `reach`, between its own by interpolation."""
-    at = (x + reach).astype(np.float32)[None], (y + reach).astype(np.float32)[None]
+def _sampled(surface: Array, x: Array, y: Array) -> Array:
+    """Returns the values of a surface (S, S) at shifts (N,), between its own by interpolation."""
+    at = (x + _REACH).astype(np.float32)[None], (y + _REACH).astype(np.float32)[None]
     return np.asarray(cv2.remap(surface.astype(np.float32), *at, cv2.INTER_LINEAR)[0], np.float64)
 
 
-def _best(part: str, surface: Array, edges: float, reach: int) -> Shift:
+def _best(part: str, surface: Array, edges: float) -> Shift:
     row, column = divmod(int(np.argmax(surface)), surface.shape[1])
     top = float(surface[row, column])
-    return Shift(
-        part, column - reach, row - reach, float(surface[reach, reach]) / top, top / float(surface.std()), edges
-    )
+    here = float(surface[_REACH, _REACH]) / top
+    return Shift(part, column - _REACH, row - _REACH, here, top / float(surface.std()), edges)

@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
 from dataflow.operator import Remembered
 from operators.geometry import se3
 
@@ -17,7 +18,9 @@ Array = NDArray[np.float64]
 _SLIDE, _SPIN = 0.008, np.deg2rad(0.2)  # standard deviations of a window's motion: m, rad
 _ROUGH_SPIN = np.deg2rad(1.5)  # the same of a sensor that measures turns only coarsely: wheels
 _KNEE = 4.0  # standard deviations beyond which a residual counts linearly
-_PRIOR = np.array([0.2, 0.2, 0.2, 0.3, 0.3])  # rad, and shares
+_PRIOR = np.diag(1.0 / np.array([0.2, 0.2, 0.2, 0.3, 0.3]) ** 2)  # information before: of rad, and of shares
+_KEEP = 0.95  # share of what is known that is kept at every window
+_SPAN, _GAP = 3_000_000_000, 350_000_000  # ns: poses kept, and the longest step between two of them
 _SURE = 3.0  # standard deviations by which a disagreement must stand out
 
 
@@ -25,10 +28,10 @@ _SURE = 3.0  # standard deviations by which a disagreement must stand out
 class Limits:
     """Holds what counts as a disagreement: shares of a way, of a turn, of a coarse turn, and an angle (rad)."""
 
-    way: float = 0.03
-    turn: float = 0.03
-    coarse_turn: float = 0.15
-    angle: float = float(np.deg2rad(1.5))
+    way: float
+    turn: float
+    coarse_turn: float
+    angle: float
 
 
 @dataclass(frozen=True)
@@ -41,17 +44,16 @@ class Window:
 
 @dataclass
 class Pair:
-    """Adds up, window by window, how the motions of one sensor differ from another's, and forgets by `keep`."""
+    """Adds up, window by window, how the motions of one sensor differ from another's, and forgets."""
 
     coarse: bool
-    information: Array = field(default_factory=lambda: np.diag(1.0 / _PRIOR**2))
+    information: Array = field(default_factory=_PRIOR.copy)
     gain: Array = field(default_factory=lambda: np.zeros(5))
 
-    def add(self, a: Array, b: Array, keep: float) -> None:
+    def add(self, a: Array, b: Array) -> None:
         """Takes the twists (6,) of the first and the second sensor over the same window."""
-        prior = np.diag(1.0 / _PRIOR**2)
-        self.information = prior + keep * (self.information - prior)
-        self.gain = keep * self.gain
+        self.information = _PRIOR + _KEEP * (self.information - _PRIOR)
+        self.gain = _KEEP * self.gain
         spin = _ROUGH_SPIN if self.coarse else _SPIN
         for part, sigma, column in ((slice(0, 3), _SLIDE, 3), (slice(3, 6), spin, 4)):
             first, second = a[part], b[part]
@@ -101,8 +103,8 @@ class MotionAgreement(Remembered):
 
     _pairs: dict[tuple[str, str], Pair]
 
-    def __init__(self, limits: Limits, keep: float = 0.95) -> None:
-        self._limits, self._keep = limits, keep
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
         self._pairs = {}
 
     def add(self, windows: Mapping[str, Window]) -> None:
@@ -110,20 +112,16 @@ class MotionAgreement(Remembered):
         for a, b in combinations(sorted(windows), 2):
             first, second = windows[a], windows[b]
             pair = self._pairs.setdefault((a, b), Pair(first.coarse or second.coarse))
-            pair.add(first.twist, second.twist, self._keep)
+            pair.add(first.twist, second.twist)
 
     def contradictions(self) -> list[Contradiction]:
-        found = []
-        for what in ("way", "turn", "direction"):
-            found += list(self._contradicted(what))
-        return found
+        return [each for what in ("way", "turn", "direction") for each in self._contradicted(what)]
 
     def _contradicted(self, what: str) -> Iterator[Contradiction]:
         sizes = {names: self._judged(pair, what) for names, pair in self._pairs.items()}
         off = {names: size for names, size in sizes.items() if size is not None and size != 0.0}
-        sensors = sorted({name for names in off for name in names})
         left = dict(off)
-        for sensor in sensors:
+        for sensor in sorted({name for names in off for name in names}):
             against = [other for names in off if sensor in names for other in names if other != sensor]
             agree = not any(pair in off for pair in combinations(sorted(against), 2))
             if len(against) >= 2 and agree:
@@ -137,16 +135,13 @@ class MotionAgreement(Remembered):
     def _judged(self, pair: Pair, what: str) -> float | None:
         """The size of a pair's disagreement, 0 where there is none, None where it is unknown."""
         x, sigma = pair.estimate(), pair.sigmas()
-        turn = self._limits.coarse_turn if pair.coarse else self._limits.turn
         if what == "direction":
-            size, spread, limit = (
-                float(np.linalg.norm(x[:3])),
-                float(sigma[int(np.argmax(np.abs(x[:3])))]),
-                self._limits.angle,
-            )
+            k, size, limit = int(np.argmax(np.abs(x[:3]))), float(np.linalg.norm(x[:3])), self._limits.angle
+        elif what == "way":
+            k, size, limit = 3, float(x[3]), self._limits.way
         else:
-            k, limit = (3, self._limits.way) if what == "way" else (4, turn)
-            size, spread = float(x[k]), float(sigma[k])
+            k, size, limit = 4, float(x[4]), self._limits.coarse_turn if pair.coarse else self._limits.turn
+        spread = float(sigma[k])
         if abs(size) > limit and abs(size) > _SURE * spread:
             return size
         return 0.0 if spread < 0.5 * limit or abs(size) + spread < limit else None
@@ -158,19 +153,18 @@ class Track(Remembered):
     stamps: list[int]
     poses: list[Array]
 
-    def __init__(self, span: int = 3_000_000_000, gap: int = 350_000_000) -> None:
-        self._span, self._gap = span, gap
+    def __init__(self) -> None:
         self.stamps, self.poses = [], []
 
     def pose(self, stamp: int, T: Array) -> None:
         self.stamps.append(stamp)
         self.poses.append(T)
-        while self.stamps[0] < stamp - self._span:
+        while self.stamps[0] < stamp - _SPAN:
             del self.stamps[0], self.poses[0]
 
     def twist(self, stamp: int, velocity: Array) -> None:
         """Goes on by the mean velocity (6,) since the last pose."""
-        if not self.stamps or stamp - self.stamps[-1] > self._gap:
+        if not self.stamps or stamp - self.stamps[-1] > _GAP:
             self.stamps, self.poses = [], []
             self.pose(stamp, np.eye(4))
         else:
@@ -180,15 +174,11 @@ class Track(Remembered):
     def between(self, begin: int, end: int) -> Array | None:
         """Returns the motion (6,) from one stamp to another; None where poses are missing."""
         first, last = self._at(begin), self._at(end)
-        if first is None or last is None:
-            return None
-        inverse = np.eye(4)
-        inverse[:3, :3], inverse[:3, 3] = first[:3, :3].T, -first[:3, :3].T @ first[:3, 3]
-        return se3.log(inverse @ last)
+        return None if first is None or last is None else se3.log(invert(first) @ last)
 
     def newest(self, now: int, age: int) -> Array | None:
         """Returns the mean velocity (6,) between the last two poses; None where they are older than `age` (ns)."""
-        if len(self.stamps) < 2 or now - self.stamps[-1] > age or self.stamps[-1] - self.stamps[-2] > self._gap:
+        if len(self.stamps) < 2 or now - self.stamps[-1] > age or self.stamps[-1] - self.stamps[-2] > _GAP:
             return None
         motion = self.between(self.stamps[-2], self.stamps[-1])
         return None if motion is None else motion / ((self.stamps[-1] - self.stamps[-2]) * 1e-9)
@@ -200,6 +190,6 @@ class Track(Remembered):
         if self.stamps[following] == stamp:
             return self.poses[following]
         before, after = self.stamps[following - 1], self.stamps[following]
-        if after - before > self._gap:
+        if after - before > _GAP:
             return None
         return se3.interpolated(self.poses[following - 1], self.poses[following], (stamp - before) / (after - before))

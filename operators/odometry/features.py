@@ -44,13 +44,10 @@ def track_corners(
     height, width = gray_to.shape
     inside = (guess_to > -20).all(axis=1) & (guess_to[:, 0] < width + 20) & (guess_to[:, 1] < height + 20)
     start = np.where(inside[:, None], guess_to, pixels_from).astype(np.float32)
-    ends, found, _ = cv2.calcOpticalFlowPyrLK(
-        gray_from, gray_to, pixels_from.astype(np.float32), start, winSize=LK_WINDOW, maxLevel=levels,
-        criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
-    )  # fmt: skip
-    moved = np.asarray(ends, np.float64)
+    ends, found = _lucas_kanade(gray_from, gray_to, pixels_from.astype(np.float32), start, levels)
+    moved = ends.astype(np.float64)
     seen = (moved >= 0).all(axis=1) & (moved[:, 0] < width) & (moved[:, 1] < height)
-    return moved, np.asarray((found.ravel() > 0) & seen & inside, np.bool_)
+    return moved, np.asarray(found & seen & inside, np.bool_)
 
 
 def with_exposure_of(reference: Gray, gray: Gray) -> Gray:
@@ -78,9 +75,11 @@ def track_both_ways(a: Gray, b: Gray, pixels: Pixels, guess: Pixels, back: float
     return ends.astype(np.float64), np.asarray(good, np.bool_)
 
 
-def _lucas_kanade(a: Gray, b: Gray, pixels: Pixels32, guess: Pixels32) -> tuple[Pixels32, Mask]:
+def _lucas_kanade(
+    a: Gray, b: Gray, pixels: Pixels32, guess: Pixels32, levels: int = LK_LEVELS
+) -> tuple[Pixels32, Mask]:
     ends, found, _ = cv2.calcOpticalFlowPyrLK(
-        a, b, pixels, guess.copy(), winSize=LK_WINDOW, maxLevel=LK_LEVELS,
+        a, b, pixels, guess.copy(), winSize=LK_WINDOW, maxLevel=levels,
         criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
     )  # fmt: skip
     return np.asarray(ends, np.float32), np.asarray(found.ravel() > 0, np.bool_)

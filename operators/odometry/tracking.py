@@ -1,14 +1,18 @@
-"""Holds the result of every visual odometry for a frame: a pose, its covariance, and its basis."""
+"""The result of every visual odometry for a frame: a pose, its covariance, and its basis; and the messages of it."""
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages import Odometry
+from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, about_fixed_axes
+from operators.status import counted_status
 
 
 class Status(StrEnum):
@@ -22,6 +26,13 @@ class Status(StrEnum):
 
 
 MEASURED = (Status.TRACKING, Status.RELOCALISED)
+LEVELS = {
+    Status.INITIALISING: Level.WARN,
+    Status.TRACKING: Level.OK,
+    Status.RELOCALISED: Level.OK,
+    Status.PREDICTED: Level.WARN,
+    Status.LOST: Level.ERROR,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,3 +61,24 @@ def scaled_covariance(covariance: Matrix, factor: float) -> Matrix:
     """Returns the covariance (6, 6) of a pose whose unit of length is another."""
     by = np.repeat([factor, 1.0], 3)
     return np.asarray(covariance * np.outer(by, by))
+
+
+def outputs(result: TrackResult, frame: str, child_frame: str) -> dict[str, Any]:
+    """Returns the messages of the ports `odometry` and `status`."""
+    odometry = Odometry.from_matrix(
+        result.T_world_camera,
+        stamp=result.stamp,
+        frame=frame,
+        child_frame=child_frame,
+        linear=result.velocity[:3],
+        angular=result.velocity[3:],
+        pose_covariance=about_fixed_axes(result.covariance, result.T_world_camera),
+    )
+    status = counted_status(
+        "visual_odometry",
+        result.stamp,
+        f"{result.status}: {result.reason}",
+        LEVELS[result.status],
+        {"inliers": result.inliers, "keyframe": int(result.keyframe)},
+    )
+    return {"odometry": odometry, "status": status}

@@ -10,12 +10,7 @@ if TYPE_CHECKING:
     from operators.perception.system import PerceptionSystem
 else:
     __getattr__, __dir__ = lazily(
-        __name__,
-        {
-            "result": ("PerceptionResult",),
-            "sensors": ("HandedSensors",),
-            "system": ("PerceptionSystem",),
-        },
+        __name__, {"result": ("PerceptionResult",), "sensors": ("HandedSensors",), "system": ("PerceptionSystem",)}
     )
 
 __all__ = ["HandedSensors", "PerceptionResult", "PerceptionSystem"]

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from dataflow.messages import (
-    CameraInfo,
-    DepthImage,
-    Image,
-    Imu,
-    Message,
-    Odometry,
-    PointCloud,
-    Transforms,
-    Twist,
-)
+from dataflow.messages import CameraInfo, DepthImage, Image, Imu, Message, Odometry, PointCloud, Transforms, Twist
 from dataflow.operator import Out, Source
 
 

@@ -1,6 +1,8 @@
-"""Cuts out what is to be recognised: the whole image, or each object found in it."""
+"""Chooses and cuts out what is to be recognised: the whole image, or each object found in it."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -10,8 +12,32 @@ from dataflow.messages import Detections2D, Image
 from operators.image.letterbox import Fit
 from operators.network_input import three_channels
 
+Per = Literal["image", "object"]
 MARGIN = 0.05
 """Share of a box by which it is enlarged on each side: boxes of detectors cut off rims."""
+
+
+class Subjects:
+    """Gives the views of each image. `missed` counts the images without detections of the same stamp."""
+
+    def __init__(self, per: Per) -> None:
+        self.per = per
+        self.missed = 0
+
+    def of(
+        self, image: Image, detections: Detections2D | None
+    ) -> tuple[list[NDArray[np.uint8]], NDArray[np.int64] | None]:
+        """Returns views (h, w, 3) and the ids of what they show; none where objects are asked for and not known."""
+        if self.per == "image":
+            return views(image, None)
+        if detections is None or detections.stamp != image.stamp:
+            self.missed += 1
+            return [], np.zeros(0, np.int64)
+        return views(image, detections)
+
+    def summary(self) -> dict[str, int]:
+        """Counts, for an operator's summary; empty where nothing is to be told."""
+        return {"images_without_detections": self.missed} if self.missed else {}
 
 
 def views(image: Image, detections: Detections2D | None) -> tuple[list[NDArray[np.uint8]], NDArray[np.int64] | None]:

@@ -14,8 +14,7 @@ from operators.inference import ModelError, Provider
 from operators.language.image_tower import ImageTower, unit_rows
 from operators.models.registry import Registry
 from operators.models.use import names_a_model, use_model
-from operators.recognition.crops import covering, letterboxed
-from operators.recognition.subjects import Per, Subjects
+from operators.recognition.crops import Per, Subjects, covering, letterboxed
 from operators.weights import open_network
 
 if TYPE_CHECKING:

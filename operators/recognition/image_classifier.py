@@ -8,8 +8,7 @@ import numpy as np
 
 from dataflow.messages import Classification, Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.recognition.crops import letterboxed
-from operators.recognition.subjects import Per, Subjects
+from operators.recognition.crops import Per, Subjects, letterboxed
 from operators.weights import NetworkFileError, open_network
 
 

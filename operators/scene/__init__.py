@@ -18,8 +18,4 @@ else:
         },
     )
 
-__all__ = [
-    "ObjectLifter",
-    "SceneGraphBuilder",
-    "SemanticMap",
-]
+__all__ = ["ObjectLifter", "SceneGraphBuilder", "SemanticMap"]

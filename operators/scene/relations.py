@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,9 +79,9 @@ def relations_of(
     A thing may stand on a table and on that table's top, which is part of it.
     `known` spares what was worked out before for pairs of bodies that are where they were.
     """
-    boxes = BoxPairs() if known is None else known
-    boxes.update(bodies)
-    found: dict[Relation, float] = {}
+    finder = _Finder(BoxPairs() if known is None else known, rules)
+    finder.boxes.update(bodies)
+    found = finder.found
     things = sorted((b for b in bodies if b.id > FLOOR), key=lambda b: b.id)
     tops = [b for b in bodies if b.id < SURFACE and b.label == TABLETOP]
     floor = next((b for b in bodies if b.id == FLOOR), None)
@@ -94,27 +94,27 @@ def relations_of(
     beside = _pairs(things, np.triu(spheres <= 1.2 * rules.near))  # each two once, since ids rise
     for person in things:
         if person.agent:
-            held |= _contact(found, person, [b for b in around[person.id] if not b.agent], things, boxes, rules)
+            held |= finder.contact(person, [b for b in around[person.id] if not b.agent], things)
     sitting = {s for s, p, _ in found if p == "sitting_on"}
     for body in things:
         if body.id not in held and body.id not in sitting:
             hidden = 0.0 if floor is None or body.agent else body.hidden_foot(floor.top)
-            _placed(found, body, stacks[body.id], floor, hidden, boxes, rules)
+            finder.placed(body, stacks[body.id], floor, hidden)
             if not body.person:
-                _on_top(found, body, tops, hidden, boxes, rules)
+                finder.on_top(body, tops, hidden)
     seen: dict[int, list[float]] = {}
     if T_world_robot is not None:
         seen = {b.id: (T_world_robot[:3, :2].T @ b.center).tolist() for b in things}
     for first in things:
         for second in stacks[first.id]:
-            _stacked(found, first, second, boxes, rules)
+            finder.stacked(first, second)
         for second in beside[first.id]:
-            _beside(found, first, second, seen, boxes, rules)
+            finder.beside(first, second, seen)
         if first.agent:
             for second in around[first.id]:
-                _moving(found, first, second, rules)
+                finder.moving(first, second)
     for top in tops:
-        _part(found, top, things, boxes, rules)
+        finder.part(top, things)
     if any(b.id == ROOM for b in bodies):
         building = [b for b in bodies if b.id == FLOOR or (b.id < SURFACE and b not in tops)]
         found |= {(b.id, "part_of", ROOM): 1.0 for b in building}
@@ -139,144 +139,131 @@ def _pairs(things: Sequence[Body], near: NDArray[np.bool_]) -> dict[int, list[Bo
     return close
 
 
-def _placed(
-    found: dict[Relation, float],
-    body: Body,
-    others: Sequence[Body],
-    floor: Body | None,
-    hidden: float,
-    boxes: BoxPairs,
-    rules: RelationRules,
-) -> None:
-    """Finds what a thing is in, or else what it stands or lies on: one thing at most.
+@dataclass
+class _Finder:
+    """Finds relations of bodies, two by two, and keeps them with their scores."""
 
-    `hidden` is how surely it stands on the floor and something hides its foot: then it is not on what its box ends at.
-    """
-    best: tuple[float, str, int] = (0.0, "", 0)
-    for other in others:
-        if other.agent:
-            continue
-        off = abs(body.bottom - other.top)
-        upon = off <= 2 * rules.touch and body.height > other.top - rules.flat
-        if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
-            continue
-        share = boxes.share(body, other)
-        if "container" in other.roles and other.volume > 1.5 * body.volume and share > 0.3:
-            inside = min(body.top, other.top) - max(body.bottom, other.bottom)
-            deep = inside / max(float(body.size[2]), 1e-3)
-            if deep > 0.5 and body.height < other.top - 0.02:
-                best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
+    boxes: BoxPairs
+    rules: RelationRules
+    found: dict[Relation, float] = field(default_factory=dict)
+
+    def placed(self, body: Body, others: Sequence[Body], floor: Body | None, hidden: float) -> None:
+        """Finds what a thing is in, or else what it stands or lies on: one thing at most.
+
+        `hidden` is how surely it stands on the floor and something hides its foot: then it is not on what its box ends
+        at.
+        """
+        best: tuple[float, str, int] = (0.0, "", 0)
+        for other in others:
+            if other.agent:
                 continue
-        if share > 0.3 and upon:
-            score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)) * (1 - hidden)
-            best = max(best, (score, "on", other.id))
-    height = body.bottom if floor is None else body.bottom - floor.top
-    if best[0] < 0.5 and floor is not None and height <= 0.3:
-        best = max(best, (1 - max(0.0, height) / 0.6, "on", FLOOR))
-    best = max(best, (hidden, "on", FLOOR))
-    if best[0] > 0:
-        found[body.id, best[1], best[2]] = best[0]
+            off = abs(body.bottom - other.top)
+            upon = off <= 2 * self.rules.touch and body.height > other.top - self.rules.flat
+            if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
+                continue
+            share = self.boxes.share(body, other)
+            if "container" in other.roles and other.volume > 1.5 * body.volume and share > 0.3:
+                inside = min(body.top, other.top) - max(body.bottom, other.bottom)
+                deep = inside / max(float(body.size[2]), 1e-3)
+                if deep > 0.5 and body.height < other.top - 0.02:
+                    best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
+                    continue
+            if share > 0.3 and upon:
+                score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * self.rules.touch)) * (1 - hidden)
+                best = max(best, (score, "on", other.id))
+        height = body.bottom if floor is None else body.bottom - floor.top
+        if best[0] < 0.5 and floor is not None and height <= 0.3:
+            best = max(best, (1 - max(0.0, height) / 0.6, "on", FLOOR))
+        best = max(best, (hidden, "on", FLOOR))
+        if best[0] > 0:
+            self.found[body.id, best[1], best[2]] = best[0]
 
+    def on_top(self, body: Body, tops: Sequence[Body], hidden: float) -> None:
+        """Finds the surface above the floor that a thing stands or lies on; `hidden` as in `placed`."""
+        best: tuple[float, int] = (0.0, 0)
+        for top in tops:
+            off = abs(body.bottom - top.top)
+            upon = body.center[2] > top.top - self.rules.flat
+            if off <= 2 * self.rules.touch and upon and (share := self.boxes.share(body, top)) > 0.3:
+                score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * self.rules.touch)) * (1 - hidden)
+                best = max(best, (score, top.id))
+        if best[0] > 0:
+            self.found[body.id, "on", best[1]] = best[0]
 
-def _on_top(
-    found: dict[Relation, float],
-    body: Body,
-    tops: Sequence[Body],
-    hidden: float,
-    boxes: BoxPairs,
-    rules: RelationRules,
-) -> None:
-    """Finds the surface above the floor that a thing stands or lies on; `hidden` as in `_placed`."""
-    best: tuple[float, int] = (0.0, 0)
-    for top in tops:
-        off = abs(body.bottom - top.top)
-        upon = body.center[2] > top.top - rules.flat
-        if off <= 2 * rules.touch and upon and (share := boxes.share(body, top)) > 0.3:
-            score = min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)) * (1 - hidden)
-            best = max(best, (score, top.id))
-    if best[0] > 0:
-        found[body.id, "on", best[1]] = best[0]
+    def part(self, top: Body, things: Sequence[Body]) -> None:
+        """Finds the thing that a surface above the floor is the top of."""
+        best: tuple[float, int] = (0.0, 0)
+        for body in things:
+            off = abs(body.top - top.top)
+            if not body.agent and off <= 3 * self.rules.touch and (share := self.boxes.share(top, body)) > 0.5:
+                best = max(best, (share * (1 - 0.5 * off / (3 * self.rules.touch)), body.id))
+        if best[0] > 0:
+            self.found[top.id, "part_of", best[1]] = best[0]
 
+    def stacked(self, first: Body, second: Body) -> None:
+        """Finds above and under of things that do not touch."""
+        between = first.bottom - second.top
+        if self.rules.touch < between <= self.rules.above and self.boxes.share(first, second) > 0.5:
+            self.found[first.id, "above", second.id] = 1 - 0.5 * between / self.rules.above
+        if second.top > first.top and second.bottom < first.bottom + 0.1 and not second.agent:
+            share = self.boxes.share(first, second)  # it stands beneath a table: within its box
+            if share > 0.4 and "container" not in second.roles and first.top < second.top - self.rules.touch:
+                self.found[first.id, "under", second.id] = share
 
-def _part(
-    found: dict[Relation, float], top: Body, things: Sequence[Body], boxes: BoxPairs, rules: RelationRules
-) -> None:
-    """Finds the thing that a surface above the floor is the top of."""
-    best: tuple[float, int] = (0.0, 0)
-    for body in things:
-        off = abs(body.top - top.top)
-        if not body.agent and off <= 3 * rules.touch and (share := boxes.share(top, body)) > 0.5:
-            best = max(best, (share * (1 - 0.5 * off / (3 * rules.touch)), body.id))
-    if best[0] > 0:
-        found[top.id, "part_of", best[1]] = best[0]
+    def beside(self, first: Body, second: Body, seen: Mapping[int, Sequence[float]]) -> None:
+        """Finds near, and of things near each other which is left of or in front of the other.
 
+        `seen` are how far ahead and how far left each is for the robot; empty without one. That of the two whose
+        difference is the larger one, and at least `side`, has a score from 0.5 on; that of the other falls fast.
+        """
+        apart = self.boxes.gap(first, second)
+        if apart > 1.2 * self.rules.near:
+            return
+        self.found[first.id, "near", second.id] = min(max(1 - 0.5 * apart / self.rules.near, 0.0), 1.0)
+        if not seen or apart > self.rules.near:
+            return
+        x, y = (a - b for a, b in zip(seen[first.id], seen[second.id], strict=True))
+        for predicate, own, other in (("left_of", y, abs(x)), ("in_front_of", -x, abs(y))):
+            least = max(other, self.rules.side)
+            score = 0.5 + _STEEP * (abs(own) - least) / least
+            if score > 0:
+                a, b = (first.id, second.id) if own > 0 else (second.id, first.id)
+                self.found[a, predicate, b] = min(1.0, score)
 
-def _stacked(found: dict[Relation, float], first: Body, second: Body, boxes: BoxPairs, rules: RelationRules) -> None:
-    """Finds above and under of things that do not touch."""
-    between = first.bottom - second.top
-    if rules.touch < between <= rules.above and boxes.share(first, second) > 0.5:
-        found[first.id, "above", second.id] = 1 - 0.5 * between / rules.above
-    if second.top > first.top and second.bottom < first.bottom + 0.1 and not second.agent:
-        share = boxes.share(first, second)  # it stands beneath a table: within its box
-        if share > 0.4 and "container" not in second.roles and first.top < second.top - rules.touch:
-            found[first.id, "under", second.id] = share
+    def contact(self, person: Body, others: Sequence[Body], things: Sequence[Body]) -> set[int]:
+        """Finds what an agent sits on and what it holds; returns the ids of what is held."""
+        held = set()
+        for other in others:
+            if "seat" in other.roles and person.person:
+                away = _from_middle(person.center, other)
+                low = person.top - other.bottom < 1.5
+                if away < 0.45 and low:
+                    self.found[person.id, "sitting_on", other.id] = 1 - away
+            elif float(other.size.max()) <= self.rules.small and person.person:
+                supported = any(
+                    abs(other.bottom - b.top) < self.rules.touch and self.boxes.share(other, b) > 0.3
+                    for b in things
+                    if not b.agent and b.id != other.id
+                )
+                lifted = 0.5 < other.center[2] - person.bottom < float(person.size[2]) + 0.1
+                if not supported and lifted and self.boxes.gap(person, other) < self.rules.hand / 2:
+                    self.found[person.id, "holding", other.id] = 1 - self.boxes.gap(person, other) / self.rules.hand
+                    held.add(other.id)
+        return held
 
-
-def _beside(
-    found: dict[Relation, float],
-    first: Body,
-    second: Body,
-    seen: Mapping[int, Sequence[float]],
-    boxes: BoxPairs,
-    rules: RelationRules,
-) -> None:
-    """Finds near, and of things near each other which is left of or in front of the other.
-
-    `seen` are how far ahead and how far left each is for the robot; empty without one. That of the two whose difference
-    is the larger one, and at least `side`, has a score from 0.5 on; that of the other falls fast.
-    """
-    apart = boxes.gap(first, second)
-    if apart > 1.2 * rules.near:
-        return
-    found[first.id, "near", second.id] = min(max(1 - 0.5 * apart / rules.near, 0.0), 1.0)
-    if not seen or apart > rules.near:
-        return
-    x, y = (a - b for a, b in zip(seen[first.id], seen[second.id], strict=True))
-    for predicate, own, other in (("left_of", y, abs(x)), ("in_front_of", -x, abs(y))):
-        least = max(other, rules.side)
-        score = 0.5 + _STEEP * (abs(own) - least) / least
-        if score > 0:
-            a, b = (first.id, second.id) if own > 0 else (second.id, first.id)
-            found[a, predicate, b] = min(1.0, score)
-
-
-def _contact(
-    found: dict[Relation, float],
-    person: Body,
-    others: Sequence[Body],
-    things: Sequence[Body],
-    boxes: BoxPairs,
-    rules: RelationRules,
-) -> set[int]:
-    """Finds what an agent sits on and what it holds; returns the ids of what is held."""
-    held = set()
-    for other in others:
-        if "seat" in other.roles and person.person:
-            away = _from_middle(person.center, other)
-            low = person.top - other.bottom < 1.5
-            if away < 0.45 and low:
-                found[person.id, "sitting_on", other.id] = 1 - away
-        elif float(other.size.max()) <= rules.small and person.person:
-            supported = any(
-                abs(other.bottom - b.top) < rules.touch and boxes.share(other, b) > 0.3
-                for b in things
-                if not b.agent and b.id != other.id
-            )
-            lifted = 0.5 < other.center[2] - person.bottom < float(person.size[2]) + 0.1
-            if not supported and lifted and boxes.gap(person, other) < rules.hand / 2:
-                found[person.id, "holding", other.id] = 1 - boxes.gap(person, other) / rules.hand
-                held.add(other.id)
-    return held
+    def moving(self, agent: Body, other: Body) -> None:
+        """Finds facing and approaching of an agent that moves: it faces the way it goes."""
+        speed = float(np.hypot(*agent.velocity[:2]))
+        way = (other.center - agent.center)[:2]
+        distance = float(np.hypot(*way))
+        if speed < self.rules.closing or distance < 0.1:
+            return
+        cosine = float(agent.velocity[:2] @ way) / (speed * distance)
+        if cosine > 0.85:
+            self.found[agent.id, "facing", other.id] = cosine
+        closing = cosine * speed - float(other.velocity[:2] @ way) / distance
+        if cosine > 0.9 and closing > self.rules.closing and distance < 3:
+            self.found[agent.id, "approaching", other.id] = cosine * min(1.0, closing / 0.4)
 
 
 def _from_middle(place: Array, seat: Body) -> float:
@@ -289,21 +276,6 @@ def _from_middle(place: Array, seat: Body) -> float:
     along, across = abs(c * x + s * y), abs(c * y - s * x)
     longer = float(seat.size[0] - seat.size[1]) / 2
     return float(np.hypot(max(along - max(longer, 0.0), 0.0), max(across - max(-longer, 0.0), 0.0)))
-
-
-def _moving(found: dict[Relation, float], agent: Body, other: Body, rules: RelationRules) -> None:
-    """Finds facing and approaching of an agent that moves: it faces the way it goes."""
-    speed = float(np.hypot(*agent.velocity[:2]))
-    way = (other.center - agent.center)[:2]
-    distance = float(np.hypot(*way))
-    if speed < rules.closing or distance < 0.1:
-        return
-    cosine = float(agent.velocity[:2] @ way) / (speed * distance)
-    if cosine > 0.85:
-        found[agent.id, "facing", other.id] = cosine
-    closing = cosine * speed - float(other.velocity[:2] @ way) / distance
-    if cosine > 0.9 and closing > rules.closing and distance < 3:
-        found[agent.id, "approaching", other.id] = cosine * min(1.0, closing / 0.4)
 
 
 class Hysteresis(Remembered):

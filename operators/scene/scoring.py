@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Detections2D, SceneGraph
 from dataflow.messages.geometry import yaw_of
 from operators.labels import LabelSpace
-from operators.scene.box_overlap import upright_iou
+from operators.scene.bodies import upright_iou
 from operators.scene.relations import FLOOR
 
 Array = NDArray[np.float64]

@@ -10,12 +10,7 @@ if TYPE_CHECKING:
     from operators.slam.visual.slam import VisualSlam
 else:  # each needs another part of scipy
     __getattr__, __dir__ = lazily(
-        __name__,
-        {
-            "landmarks.slam": ("LandmarkSlam",),
-            "lidar.slam": ("LidarSlam",),
-            "visual.slam": ("VisualSlam",),
-        },
+        __name__, {"landmarks.slam": ("LandmarkSlam",), "lidar.slam": ("LidarSlam",), "visual.slam": ("VisualSlam",)}
     )
 
 __all__ = ["LandmarkSlam", "LidarSlam", "VisualSlam"]

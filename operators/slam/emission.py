@@ -13,13 +13,9 @@ from dataflow.messages.geometry import matrix_to_quaternion
 from operators.geometry.se3 import Matrix, about_fixed_axes
 from operators.slam.place import Place
 from operators.slam.place_graph import PlaceGraph
+from operators.slam.sensor_model import Added
 
-LEVELS = {
-    Place.MAPPED: Level.OK,
-    Place.CORRECTED: Level.OK,
-    Place.SEARCHING: Level.WARN,
-    Place.ADRIFT: Level.WARN,
-}
+LEVELS = {Place.MAPPED: Level.OK, Place.CORRECTED: Level.OK, Place.SEARCHING: Level.WARN, Place.ADRIFT: Level.WARN}
 
 
 def corrections(
@@ -63,10 +59,16 @@ def map_poses(graph: PlaceGraph[Any]) -> list[tuple[int, Matrix]]:
     return [(node.stamp, node.T) for node in graph.nodes.values() if node.island in graph.tied]
 
 
+def map_due(graph: PlaceGraph[Any], added: Added, period: int) -> bool:
+    """Returns whether the map is sent after what was just added: at every loop and every `period` keyframes."""
+    return graph.located and (added.loops > 0 or (added.node and len(graph.nodes) % period == 0))
+
+
 def sizes(graph: PlaceGraph[Any]) -> dict[str, int]:
-    """Returns the number of keyframes, and of those that keep a view."""
+    """Returns the number of keyframes, of those that keep a view, and of loops."""
     nodes = graph.nodes.values()
-    return {"keyframes": len(nodes), "views": sum(node.view is not None for node in nodes)}
+    views = sum(node.view is not None for node in nodes)
+    return {"keyframes": len(nodes), "views": views, "loops": graph.loops}
 
 
 def status_of(name: str, place: Place, reason: str, counts: Mapping[str, int], odometry: Diagnostics) -> Diagnostics:

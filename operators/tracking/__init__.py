@@ -10,13 +10,7 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = lazily(
         __name__,
-        {
-            "multi_object_tracker": ("MultiObjectTracker",),
-            "multi_object_tracker_3d": ("MultiObjectTracker3D",),
-        },
+        {"multi_object_tracker": ("MultiObjectTracker",), "multi_object_tracker_3d": ("MultiObjectTracker3D",)},
     )
 
-__all__ = [
-    "MultiObjectTracker",
-    "MultiObjectTracker3D",
-]
+__all__ = ["MultiObjectTracker", "MultiObjectTracker3D"]

@@ -1,10 +1,14 @@
-"""Matching of tracks with detections: overlaps and the best assignment."""
+"""Matching of tracks with detections: overlaps, the best assignment, and what a detection speaks for."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from dataflow.messages import Boxes3D, Detections2D
 
 Array = NDArray[np.float64]
 
@@ -26,3 +30,17 @@ def assign(value: Array, allowed: NDArray[np.bool_]) -> list[tuple[int, int]]:
     gain = np.where(allowed, value + 1.0, 0.0)  # any allowed pair is better than none
     rows, columns = linear_sum_assignment(gain, maximize=True)
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if allowed[r, c]]
+
+
+def log_odds(score: float, least: float = 0.1) -> float:
+    """Returns the evidence of one detection; even a weak one that fits a track speaks for it by the least."""
+    bounded = min(max(score, 0.02), 0.95)
+    return max(math.log(bounded / (1 - bounded)), least)
+
+
+def class_ids_of(message: Detections2D | Boxes3D, classes: list[str]) -> NDArray[np.int32]:
+    """Returns the ids (N,) of a message's rows in a list of classes, which grows with the names that arrive."""
+    if not message.class_names:
+        return message.class_ids
+    classes += [name for name in message.class_names if name not in classes]
+    return np.array([classes.index(name) for name in message.class_names], np.int32)[message.class_ids]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
 from dataflow.operator import Remembered
-from operators.tracking.assignment import assign, overlap
+from operators.tracking.assignment import assign, log_odds, overlap
 from operators.tracking.box_filter import BoxFilter, BoxNoise, boxes_of, predict
 
 Array = NDArray[np.float64]
@@ -205,7 +205,7 @@ class BoxTracker(Remembered):
 
     def _see(self, track: BoxTrack, stamp: int, box: Array, score: float, feature: Array | None) -> None:
         track.filter.update(box, score)
-        track.evidence = min(max(track.evidence, 0.0) + _log_odds(score), _MOST)
+        track.evidence = min(max(track.evidence, 0.0) + log_odds(score), _MOST)
         track.seen, track.hits = stamp, track.hits + 1
         if track.state != TrackState.TENTATIVE or track.evidence >= self._settings.confirm:
             track.state = TrackState.CONFIRMED
@@ -227,7 +227,7 @@ class BoxTracker(Remembered):
             track.state = TrackState.ENDED
 
     def _begin(self, stamp: int, box: Array, score: float, class_id: int, feature: Array | None, row: int) -> None:
-        evidence = _log_odds(score)
+        evidence = log_odds(score)
         state = TrackState.CONFIRMED if evidence >= self._settings.confirm else TrackState.TENTATIVE
         filter = self._settings.filter(box, score, self._settings.noise)
         track = BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature, row=row)
@@ -238,12 +238,6 @@ class BoxTracker(Remembered):
             track.twins.add(twin.id)
         self.tracks.append(track)
         self._next += 1
-
-
-def _log_odds(score: float) -> float:
-    """Evidence of one detection; even a weak one that fits a track speaks for it."""
-    bounded = min(max(score, 0.02), 0.95)
-    return max(math.log(bounded / (1 - bounded)), 0.1)
 
 
 def _grown(boxes: Array, share: float) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
 from dataflow.operator import Remembered
-from operators.tracking.assignment import assign
+from operators.tracking.assignment import assign, log_odds
 from operators.tracking.box_filter import kalman
 
 Array = NDArray[np.float64]
@@ -149,7 +149,7 @@ class BoxTracker3D(Remembered):
         track.yaw = self._heading(track, float(found.yaws[k]), share)
         track.size = track.size + share * (found.sizes[k] - track.size)
         track.size_weight = min(track.size_weight + score, 10.0)
-        track.evidence = min(max(track.evidence, 0.0) + _log_odds(score), _MOST)
+        track.evidence = min(max(track.evidence, 0.0) + log_odds(score), _MOST)
         track.seen = stamp
         if track.state != TrackState.TENTATIVE or track.evidence >= self._settings.confirm:
             track.state = TrackState.CONFIRMED
@@ -179,7 +179,7 @@ class BoxTracker3D(Remembered):
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = self._noise(found, k)
         covariance[3:, 3:] = np.eye(3) * self._settings.first_speed**2
-        evidence = _log_odds(score)
+        evidence = log_odds(score)
         self.tracks.append(
             SolidTrack(
                 id=self._next,
@@ -196,8 +196,3 @@ class BoxTracker3D(Remembered):
             )
         )
         self._next += 1
-
-
-def _log_odds(score: float) -> float:
-    bounded = min(max(score, 0.02), 0.95)
-    return max(math.log(bounded / (1 - bounded)), 0.1)

@@ -14,6 +14,7 @@ from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, 
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.status import counted_status
+from operators.tracking.assignment import class_ids_of
 from operators.tracking.box_filter import BoxFilter, BoxNoise, FilterpyBoxFilter, boxes_of
 from operators.tracking.box_tracker import BoxTrack, BoxTracker, BoxTrackerSettings
 
@@ -97,7 +98,7 @@ class MultiObjectTracker(Operator):
             detections.stamp,
             boxes[rows],
             detections.scores[rows].astype(np.float64),
-            self._class_ids(detections)[rows],
+            class_ids_of(detections, self.state.classes)[rows],
             view[1:],
             vectors,
         )
@@ -113,16 +114,6 @@ class MultiObjectTracker(Operator):
     def on_reset(self, input: str) -> None:
         """Drops all tracks: the clock of an input was reset."""
         self.state.tracker.forget()
-
-    def _class_ids(self, detections: Detections2D) -> NDArray[np.int32]:
-        """Returns ids (N,) in the tracker's own list of classes, which grows with the names that arrive."""
-        if not detections.class_names:
-            return detections.class_ids
-        for name in detections.class_names:
-            if name not in self.state.classes:
-                self.state.classes.append(name)
-        own = np.array([self.state.classes.index(name) for name in detections.class_names], np.int32)
-        return own[detections.class_ids]
 
     def _vectors(
         self, detections: Detections2D, features: FeatureVector | None, rows: NDArray[np.intp]

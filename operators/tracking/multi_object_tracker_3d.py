@@ -20,6 +20,7 @@ from dataflow.messages.geometry import (
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.status import counted_status
+from operators.tracking.assignment import class_ids_of
 from operators.tracking.box_tracker_3d import BoxTracker3D, BoxTracker3DSettings, Solids, SolidTrack
 
 
@@ -120,18 +121,10 @@ class MultiObjectTracker3D(Operator):
             sizes,
             yaws,
             boxes.scores[rows].astype(np.float64),
-            self._class_ids(boxes)[rows],
+            class_ids_of(boxes, self.state.classes)[rows],
             covariances,
         )
         return found, boxes.count - len(rows)
-
-    def _class_ids(self, boxes: Boxes3D) -> Any:
-        if not boxes.class_names:
-            return boxes.class_ids
-        for name in boxes.class_names:
-            if name not in self.state.classes:
-                self.state.classes.append(name)
-        return np.array([self.state.classes.index(name) for name in boxes.class_names], np.int32)[boxes.class_ids]
 
     def _message(self, now: int, frame: str, tracks: list[SolidTrack]) -> Tracks:
         means = np.array([t.mean for t in tracks]).reshape(-1, 6)

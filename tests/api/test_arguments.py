@@ -55,33 +55,33 @@ def test_verify_takes_the_first_operator_of_those_to_verify(tmp_path: Path) -> N
 
 
 CALLS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "open": (lambda p: dataflow.open(3), r"open\(\): path: expected a text or a path, got 3 \(int\)"),  # type: ignore[arg-type]
+    "open": (lambda p: dataflow.open(3), r"open\(\): path: expected a text or a path, got 3 \(int\)"),
     "run: graph": (
-        lambda p: dataflow.run(7),  # type: ignore[arg-type]
+        lambda p: dataflow.run(7),
         r"run\(\): graph: expected a GraphBuilder, a Graph, a text or a path, got 7 \(int\)",
     ),
     "run: settings": (
-        lambda p: dataflow.run("graph.yaml", settings=["camera.rate=3"]),  # type: ignore[arg-type]
+        lambda p: dataflow.run("graph.yaml", settings=["camera.rate=3"]),
         r"run\(\): settings: expected a dictionary from texts to values or None, got \['camera.rate=3'\] \(list\)",
     ),
     "run: watch": (
-        lambda p: dataflow.run("graph.yaml", watch=True),  # type: ignore[arg-type]
+        lambda p: dataflow.run("graph.yaml", watch=True),
         r"run\(\): watch: expected a function or None, got True \(bool\)",
     ),
     "replay: clock": (
-        lambda p: dataflow.replay(p, clock="headers"),  # type: ignore[arg-type]
+        lambda p: dataflow.replay(p, clock="headers"),
         r"replay\(\): clock: expected 'auto', 'header' or 'log', got 'headers' \(str\)",
     ),
     "replay: start": (
-        lambda p: dataflow.replay(p, start="3 s"),  # type: ignore[arg-type]
+        lambda p: dataflow.replay(p, start="3 s"),
         r"replay\(\): start: expected a number or None, got '3 s' \(str\)",
     ),
     "replay: maps": (
-        lambda p: dataflow.replay(p, maps={"/camera": 3}),  # type: ignore[dict-item]
+        lambda p: dataflow.replay(p, maps={"/camera": 3}),
         r"replay\(\): maps\['/camera'\]: expected a text, got 3 \(int\)",
     ),
     "launch: live": (
-        lambda p: dataflow.launch(watch(), live="yes"),  # type: ignore[arg-type]
+        lambda p: dataflow.launch(watch(), live="yes"),
         r"launch\(\): live: expected True or False, got 'yes' \(str\)",
     ),
     "launch: option": (
@@ -93,15 +93,15 @@ CALLS: dict[str, tuple[Callable[[Path], object], str]] = {
         r"launch\(\): rate: expected a number or None, got 'fast' \(str\)",
     ),
     "verify: only": (
-        lambda p: dataflow.verify(p, only=3),  # type: ignore[arg-type]
+        lambda p: dataflow.verify(p, only=3),
         r"verify\(\): only: expected a text, a sequence of texts or None, got 3 \(int\)",
     ),
     "verify: only holds": (
-        lambda p: dataflow.verify(p, only=["meter", None]),  # type: ignore[list-item]
+        lambda p: dataflow.verify(p, only=["meter", None]),
         r"verify\(\): only\[1\]: expected a text, got None",
     ),
     "verify: jobs": (
-        lambda p: dataflow.verify(p, jobs=1.5),  # type: ignore[arg-type]
+        lambda p: dataflow.verify(p, jobs=1.5),
         r"verify\(\): jobs: expected a whole number or None, got 1.5 \(float\)",
     ),
     "Session: outputs": (
@@ -109,31 +109,31 @@ CALLS: dict[str, tuple[Callable[[Path], object], str]] = {
         r"Session\(\): outputs: expected a list of texts or None, got 'meter/brightness' \(str\)",
     ),
     "Session: static": (
-        lambda p: dataflow.Session(watch(), static={"camera/info": 3}),  # type: ignore[dict-item]
+        lambda p: dataflow.Session(watch(), static={"camera/info": 3}),
         r"Session\(\): static\['camera/info'\]: expected a Message, got 3 \(int\)",
     ),
     "play": (
-        lambda p: dataflow.play(Photometer(), {"image": [3]}),  # type: ignore[list-item]
+        lambda p: dataflow.play(Photometer(), {"image": [3]}),
         r"play\(\): streams\['image'\]\[0\]: expected a Message, got 3 \(int\)",
     ),
     "play: a class": (
-        lambda p: dataflow.play(Photometer),  # type: ignore[arg-type]
+        lambda p: dataflow.play(Photometer),
         r"play\(\): operator: expected an Operator, got the class Photometer",
     ),
     "Graph": (
-        lambda p: dataflow.Graph(threads="2"),  # type: ignore[arg-type]
+        lambda p: dataflow.Graph(threads="2"),
         r"Graph\(\): threads: expected a whole number, got '2' \(str\)",
     ),
     "Graph.add": (
-        lambda p: dataflow.Graph().add(Camera, "camera"),  # type: ignore[arg-type]
+        lambda p: dataflow.Graph().add(Camera, "camera"),
         r"Graph\.add\(\): name: expected a text, got the class Camera",
     ),
     "Graph.connect": (
-        lambda p: watch().connect("meter", image=3),  # type: ignore[arg-type]
+        lambda p: watch().connect("meter", image=3),
         r"Graph\.connect\(\): image: expected a text or a list of texts, got 3 \(int\)",
     ),
     "Graph.record": (
-        lambda p: watch().record("a", 3),  # type: ignore[arg-type]
+        lambda p: watch().record("a", 3),
         r"Graph\.record\(\): topics\[1\]: expected a text, got 3 \(int\)",
     ),
 }
@@ -150,15 +150,15 @@ def test_recordings_and_streams_name_wrong_types(recording: dataflow.RecordedStr
     name = next(iter(recording))
     stream = recording[name]
     wrong: list[tuple[Callable[[], object], str]] = [
-        (lambda: recording[3], r"__getitem__\(\): name: expected a text, got 3"),  # type: ignore[index]
-        (lambda: recording.select([name]), r"select\(\): names\[0\]: expected a text, got \["),  # type: ignore[arg-type]
-        (lambda: recording.between("0"), r"between\(\): start: expected a number or None, got '0'"),  # type: ignore[arg-type]
-        (lambda: recording.within(0.5), r"within\(\): first: expected a whole number or None, got 0.5"),  # type: ignore[arg-type]
-        (lambda: recording.join(name, direction="near"), r"join\(\): direction: expected 'backward', 'forward' or 'ne"),  # type: ignore[arg-type]
-        (lambda: stream[0.5], r"expected a place, a slice, or a field's name, got 0.5"),  # type: ignore[call-overload]
-        (lambda: stream.column(0), r"column\(\): field: expected a text, got 0"),  # type: ignore[arg-type]
-        (lambda: stream.frame(["stamp"]), r"frame\(\): fields\[0\]: expected a text"),  # type: ignore[arg-type]
-        (lambda: stream.at("now"), r"at\(\): seconds: expected a number, got 'now'"),  # type: ignore[arg-type]
+        (lambda: recording[3], r"__getitem__\(\): name: expected a text, got 3"),
+        (lambda: recording.select([name]), r"select\(\): names\[0\]: expected a text, got \["),
+        (lambda: recording.between("0"), r"between\(\): start: expected a number or None, got '0'"),
+        (lambda: recording.within(0.5), r"within\(\): first: expected a whole number or None, got 0.5"),
+        (lambda: recording.join(name, direction="near"), r"join\(\): direction: expected 'backward', 'forward' or 'ne"),
+        (lambda: stream[0.5], r"expected a place, a slice, or a field's name, got 0.5"),
+        (lambda: stream.column(0), r"column\(\): field: expected a text, got 0"),
+        (lambda: stream.frame(["stamp"]), r"frame\(\): fields\[0\]: expected a text"),
+        (lambda: stream.at("now"), r"at\(\): seconds: expected a number, got 'now'"),
     ]
     for call, sentence in wrong:
         with pytest.raises(TypeError, match=sentence):
@@ -170,9 +170,9 @@ def test_a_session_names_what_is_no_dictionary_of_messages() -> None:
         with pytest.raises(
             TypeError, match=r"Session\.put\(\): messages: expected a dictionary from texts to Messages"
         ):
-            session.put(1, Number(stamp=1, value=1.0))  # type: ignore[arg-type]
+            session.put(1, Number(stamp=1, value=1.0))
         with pytest.raises(TypeError, match=r"Session\.put\(\): stamp: expected a whole number, got 0.5"):
-            session.put(0.5, {})  # type: ignore[arg-type]
+            session.put(0.5, {})
 
 
 FITS: list[tuple[Any, Any]] = [
@@ -222,7 +222,7 @@ def test_what_the_call_itself_refuses_is_left_to_it() -> None:
 
     assert sized(2, height=3) == 6
     with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'"):
-        sized(2, heigth=3)  # type: ignore[call-arg]
+        sized(2, heigth=3)
     assert describe(Sequence[float]) == "a sequence of numbers"
 
 

@@ -40,9 +40,7 @@ def test_columns_are_what_the_messages_hold(recording: dataflow.RecordedStreams)
                     np.testing.assert_array_equal(found, value)
 
 
-def test_images_of_one_size_are_stacked_and_lists_of_any_length_stay_apart(
-    recording: dataflow.RecordedStreams,
-) -> None:
+def test_images_of_one_size_are_stacked_and_lists_of_any_length_stay_apart(recording: dataflow.RecordedStreams) -> None:
     assert recording["image"]["data"].shape == (3, 3, 4, 3)
     boxes = recording["objects"]["boxes"]
     assert boxes.dtype == object

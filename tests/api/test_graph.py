@@ -126,7 +126,7 @@ def test_mistakes_are_those_of_the_graph_language() -> None:
     with pytest.raises(ValueError, match="there is an operator 'meter' already"):
         watch().add("meter", Photometer)
     with pytest.raises(TypeError, match=r"parameters are keywords"):
-        dataflow.Graph().add("camera", Camera())  # type: ignore[arg-type]
+        dataflow.Graph().add("camera", Camera())
     with pytest.raises(TypeError, match="has no place in a graph"):
         dataflow.Graph().add("camera", Camera, frames=object())
 
@@ -176,7 +176,7 @@ def test_a_replay_from_the_middle_goes_on_with_the_state_of_then(tmp_path: Path)
         assert recording["count"]["value"].tolist() == [4.0, 5.0, 6.0]
 
 
-def test_progress_is_told_while_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_reported_while_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.api.local.SHOW_EVERY", 0.0)
     seen: list[Status] = []
     watch().run(watch=seen.append)

@@ -42,7 +42,7 @@ def test_every_match_is_the_one_that_a_search_finds(
 
 def test_an_unknown_direction_is_refused() -> None:
     with pytest.raises(ValueError, match="expected backward, forward, nearest"):
-        asof(np.zeros(1, np.int64), np.zeros(1, np.int64), "sideways")  # type: ignore[arg-type]
+        asof(np.zeros(1, np.int64), np.zeros(1, np.int64), "sideways")
 
 
 def test_rows_hold_the_messages_and_none_where_there_is_no_match(recording: dataflow.RecordedStreams) -> None:

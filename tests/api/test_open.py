@@ -113,7 +113,7 @@ def test_a_recording_whose_writer_was_killed_opens_up_to_its_last_chunk(path: Pa
         assert recording["imu"][10] == imu(10)
 
 
-def test_a_closed_recording_says_so(path: Path) -> None:
+def test_reading_a_closed_recording_is_refused(path: Path) -> None:
     with dataflow.open(path) as recording:
         stream = recording["imu"]
         assert stream[0] == imu(0)

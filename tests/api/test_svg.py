@@ -10,7 +10,7 @@ import pytest
 from watched import Camera, Judge, Photometer
 
 import dataflow
-from dataflow.api.svg import graph_svg, layers
+from dataflow.api.html import graph_svg, layers
 from dataflow.graph import load_graph
 
 SPACE = "{http://www.w3.org/2000/svg}"

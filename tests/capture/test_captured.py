@@ -103,7 +103,7 @@ def test_answers_of_a_service_are_in_the_test(tmp_path: Path) -> None:
 
     outcome = Captured.from_bytes(made.to_bytes()).play()
     assert outcome.error is None
-    assert re.search(r" at 0\.\d+", outcome.outputs["text"].text)  # type: ignore[attr-defined]
+    assert re.search(r" at 0\.\d+", outcome.outputs["text"].text)
 
 
 def test_text_of_the_recording_is_no_code_of_the_test(late: Path, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_text_of_the_recording_is_no_code_of_the_test(late: Path, tmp_path: Path
 def test_a_parameter_is_changed_where_it_was(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = captured(changed, "tuned")
 
-    changes = [(shot.firing.inputs["x"].value.vectors[0, 0], shot.changes) for shot in made.shots if shot.changes]  # type: ignore[union-attr]
+    changes = [(shot.firing.inputs["x"].value.vectors[0, 0], shot.changes) for shot in made.shots if shot.changes]
     assert [(k, change.name, change.value) for k, [change] in changes] == [(tuned.CHANGED, "factor", 3.0)]
     read = Captured.from_bytes(made.to_bytes())
     with pytest.raises(AssertionError, match=r"tuned: out\.vectors"):
@@ -150,7 +150,7 @@ def test_a_reset_is_made_where_it_was(changed: Path) -> None:
     read = Captured.from_bytes(again.to_bytes())
     assert read.shots[-1].changes == (reset,)
     outcome = replace(read, shots=(*read.shots[:-1], read.shots[-1]._replace(firing=earlier[-1].firing))).play()
-    assert outcome.outputs["out"].vectors[0, 0] == 3.0 * (tuned.WRONG - 1)  # type: ignore[attr-defined]
+    assert outcome.outputs["out"].vectors[0, 0] == 3.0 * (tuned.WRONG - 1)
 
 
 @pytest.mark.long
@@ -166,7 +166,7 @@ def test_calls_that_give_something_else_apart_are_no_test(changed: Path, monkeyp
 def test_a_silent_output_is_none_for_an_expression(changed: Path) -> None:
     made = captured(changed, "rare", predicate="out.out is None")
 
-    assert [shot.firing.inputs["x"].value.vectors[0, 0] for shot in made.shots] == [5.0]  # type: ignore[union-attr]
+    assert [shot.firing.inputs["x"].value.vectors[0, 0] for shot in made.shots] == [5.0]
     with pytest.raises(AssertionError, match=r"rare: out\.out is None"):
         made.check()
     with pytest.raises(AssertionError, match=r"out\.out\.vectors.* raises AttributeError: .*whether the call is right"):

@@ -133,7 +133,7 @@ def test_what_may_be_as_it_was_is_no_cause_where_the_operator_or_a_file_has_chan
 def test_what_makes_runs_differ_is_a_cause_whatever_has_changed() -> None:
     findings = Findings(Rerun(("",)), repeats=False, settled=True, causes=["wall clock"])
 
-    assert _answer(findings, None, None, Verification("x"), revised=True).causes  # type: ignore[arg-type]
+    assert _answer(findings, None, None, Verification("x"), revised=True).causes
 
 
 def test_facts_of_the_machine_are_no_change_of_an_operator() -> None:
@@ -162,7 +162,7 @@ def test_changed_code_is_reported_before_what_the_results_also_depend_on() -> No
 
     print_reasons(console, "", [Why("x", repeats=True, changed=("code of op",), also=(gain,))])
 
-    assert console.file.getvalue().splitlines() == [  # type: ignore[attr-defined]
+    assert console.file.getvalue().splitlines() == [
         "x: it repeats here, and this is not as it was recorded (0 re-runs, 0.00 s)",
         "x: not as it was recorded: code of op",
         "x: its results also depend on environment variable GAIN (op.py:20), not known for the recording",
@@ -197,10 +197,10 @@ def test_sources_of_chance_that_it_reads_in_vain_are_listed_before_devices() -> 
     findings.cleared = ["monotonic clock", "random"]
     console = Console(file=io.StringIO(), width=200)
 
-    found = _answer(findings, None, None, Verification("x"), revised=False)  # type: ignore[arg-type]
+    found = _answer(findings, None, None, Verification("x"), revised=False)
     print_reasons(console, "", [found])
 
-    first, second = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    first, second = console.file.getvalue().splitlines()
     assert first == "x: reads the monotonic clock at op.py:60; no effect seen in 5 re-runs"
     assert "may have changed (what it reads, as above, may show in few runs; files that C libraries read" in second
     assert [read["calls"] for read in found.as_json()["reads"]] == [40]

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
-
-from dataflow.cli.main import app
+from cli_commands import call
 
 RUNTIME_TESTS = Path(__file__).resolve().parent.parent / "runtime"
 sys.path.append(str(RUNTIME_TESTS))
@@ -44,15 +42,6 @@ def _registry_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[N
 
 @pytest.fixture(scope="session")
 def dataflow() -> Command:
-    """Calls a command; the outcome has `exit_code`, `stdout` and `stderr`."""
-
-    def call(*words: object, code: int = 0) -> Outcome:
-        outcome = CliRunner().invoke(app, [str(word) for word in words])
-        told = f"{outcome.stdout}\n{outcome.stderr}\n{outcome.exception!r}"
-        assert outcome.exit_code == code, told
-        assert "Traceback" not in outcome.stderr or code == 1, told
-        return outcome
-
     return call
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_mcap import foreign_mcap
 from made_bags import SECOND, header, ros, write_ros1, write_ros2, xyz, xyzw
 
 START = 1_700_000_000 * SECOND
@@ -119,69 +120,6 @@ def test_latencies_of_a_file_without_firing_records_are_refused_with_the_reason(
     assert "holds no firing records" in dataflow("latency", tmp_path / "drive.mcap", code=2).stderr
 
 
-@pytest.fixture(scope="module")
-def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Another program's MCAP of 400 poses in chunks, one of them damaged, and how many are in that."""
-    from mcap.reader import make_reader
-    from mcap.writer import Writer
-
-    folder = tmp_path_factory.mktemp("damaged")
-    source = write_ros2(folder / "bag", [row for _ in range(20) for row in poses(("/pose",))])
-    file = folder / "drive.mcap"
-    with (source / "bag.mcap").open("rb") as opened, file.open("wb") as target:
-        writer = Writer(target, chunk_size=4096)
-        writer.start("ros2")
-        channel = None
-        for k, (schema, known, message) in enumerate(make_reader(opened).iter_messages()):
-            assert schema is not None
-            if channel is None:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channel = writer.register_channel(known.topic, known.message_encoding, number)
-            stamp = START + k * SECOND // 100
-            writer.add_message(channel, stamp, message.data, stamp, k)
-        writer.finish()
-    with file.open("rb") as opened:
-        summary = make_reader(opened).get_summary()
-        assert summary is not None
-        chunk = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)[3]
-    data = bytearray(file.read_bytes())
-    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
-    file.write_bytes(data)
-    return file, (chunk.message_end_time - chunk.message_start_time) * 100 // SECOND + 1
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["convert", "FILE", "OUT", "--to", "mcap", "--clock", "log", "--json"],
-        ["convert", "FILE", "OUT", "--to", "csv", "--clock", "log", "--json"],
-        ["convert", "FILE", "OUT", "--to", "ros2", "--json"],
-        ["lint", "FILE", "--json"],
-        ["cut", "FILE", "-o", "OUT", "--from", "0", "--json"],
-        ["filter", "FILE", "-o", "OUT", "--stream", "/pose", "--json"],
-    ],
-    ids=lambda words: " ".join(words[:1] + words[3:5]),
-)
-def test_commands_pass_over_a_damaged_chunk_and_count_it(
-    dataflow, damaged: tuple[Path, int], tmp_path: Path, words: list[str]
-) -> None:
-    file, lost = damaged
-    suffix = "" if "csv" in words or "ros2" in words else ".mcap"
-    places = {"FILE": file, "OUT": tmp_path / f"out{suffix}"}
-
-    done = dataflow(*(places.get(word, word) for word in words), code=1)
-
-    assert f"{lost} messages lost to damage" in done.stdout + done.stderr
-    assert "chunk 3 at byte" in done.stdout
-
-
-def test_strict_refuses_a_damaged_chunk(dataflow, damaged: tuple[Path, int], tmp_path: Path) -> None:
-    told = dataflow("convert", damaged[0], tmp_path / "a.mcap", "--to", "mcap", "--strict", code=2).stderr
-
-    assert "topic /pose: chunk 3 at byte" in told
-    assert not (tmp_path / "a.mcap").exists()
-
-
 def test_topics_of_bags_stay_absolute_behind_a_prefix(dataflow, bag: Path, tmp_path: Path) -> None:
     file = bag / "drive.mcap"
     other = tmp_path / "other.mcap"
@@ -254,17 +192,12 @@ def test_options_of_bags_are_refused_when_a_recording_is_replayed(dataflow, reco
 
 
 def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    file = tmp_path / "drive.mcap"
-    with file.open("wb") as opened:
-        writer = Writer(opened)
-        writer.start()
-        channel = writer.register_channel("/a", "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.add_metadata("vehicle", {"name": "truck 7"})
-        writer.add_attachment(1, 1, "calib.txt", "text/plain", b"P0: 1")
-        writer.finish()
+    file = foreign_mcap(
+        tmp_path / "drive.mcap",
+        [("/a", 1, b"{}")],
+        metadata={"vehicle": {"name": "truck 7"}},
+        attachments=[("calib.txt", "text/plain", 1, 1, b"P0: 1")],
+    )
 
     told = json.loads(dataflow("info", file, "--json").stdout)
 
@@ -274,7 +207,7 @@ def test_metadata_records_and_attachments_of_others_are_shown(dataflow, tmp_path
     assert "truck 7" in dataflow("info", file, "--metadata").stdout
 
 
-def test_a_bag_without_metadata_records_says_so(dataflow, tmp_path: Path) -> None:
+def test_bag_without_metadata_records_is_reported(dataflow, tmp_path: Path) -> None:
     from made_bags import ROS1
 
     text = ros("std_msgs/String", ROS1, data="hello")

@@ -143,7 +143,7 @@ def test_the_viewer_is_given_what_calls_that_are_gone_to_were_given_and_made(pro
     shell.onecmd("goto 2")
     fired = shell._debugger.at
     assert fired is not None
-    given = [(entry.stream, entry.stamp) for value in fired.firing.inputs.values() for entry in entries_of(value)]  # type: ignore[union-attr]
+    given = [(entry.stream, entry.stamp) for value in fired.firing.inputs.values() for entry in entries_of(value)]
     made = [(each.stream, each.here.stamp) for each in fired.made if each.here is not None]
     assert given
     assert made

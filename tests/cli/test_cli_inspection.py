@@ -13,7 +13,7 @@ operators:
 """
 
 
-def test_check_says_ok_or_places_every_fault(dataflow, small: Path, tmp_path: Path) -> None:
+def test_check_reports_ok_or_locates_every_fault(dataflow, small: Path, tmp_path: Path) -> None:
     faulty = tmp_path / "faulty.yaml"
     faulty.write_text(FAULTY)
 
@@ -22,24 +22,10 @@ def test_check_says_ok_or_places_every_fault(dataflow, small: Path, tmp_path: Pa
     assert f"{faulty}:4:" in told.stdout
     assert "did you mean 'Counter'?" in told.stdout
     assert "1 of 2 graphs cannot run" in told.stderr
-
-
-def test_check_prints_faults_as_json(dataflow, small: Path, tmp_path: Path) -> None:
-    faulty = tmp_path / "faulty.yaml"
-    faulty.write_text(FAULTY)
-
     assert json.loads(dataflow("check", small, "--json").stdout) == {"ok": True, "problems": []}
     (problem,) = json.loads(dataflow("check", faulty, "--json", code=1).stdout)["problems"]
     assert (problem["file"], problem["line"]) == (str(faulty), 4)
-
-
-def test_check_of_a_missing_file_could_not_run(dataflow, small: Path) -> None:
-    wrong = small.with_name("smal.yaml")
-
-    assert f"did you mean {small}?" in dataflow("check", wrong, code=2).stderr
-
-
-def test_check_takes_settings(dataflow, small: Path) -> None:
+    assert f"did you mean {small}?" in dataflow("check", small.with_name("smal.yaml"), code=2).stderr
     dataflow("check", small, "--set", "smooth.sleep=0.5")
     assert "no parameter 'nope'" in dataflow("check", small, "--set", "nope=1", code=1).stdout
 

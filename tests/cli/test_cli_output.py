@@ -6,6 +6,7 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,22 +26,19 @@ from dataflow.text import jsonable
 
 
 @pytest.mark.parametrize(
-    ("nbytes", "text"), [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (999_960, "1.0 MB"), (3.21e9, "3.2 GB")]
+    ("written", "text"),
+    [
+        *((size(n), text) for n, text in ((0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (999_960, "1.0 MB"))),
+        *((seconds(n), text) for n, text in ((0.634, "0.63 s"), (9.999, "10.0 s"), (59.97, "1 min 00 s"))),
+        (size(3.21e9), "3.2 GB"),
+        (seconds(245), "4 min 05 s"),
+        (seconds(7380), "2 h 03 min"),
+        (plural(1, "stream"), "1 stream"),
+        (plural(1200, "stream"), "1,200 streams"),
+    ],
 )
-def test_sizes_change_unit_at_a_thousand(nbytes: float, text: str) -> None:
-    assert size(nbytes) == text
-
-
-@pytest.mark.parametrize(
-    ("duration", "text"),
-    [(0.634, "0.63 s"), (9.999, "10.0 s"), (59.97, "1 min 00 s"), (245, "4 min 05 s"), (7380, "2 h 03 min")],
-)
-def test_durations_are_written_for_people(duration: float, text: str) -> None:
-    assert seconds(duration) == text
-
-
-def test_one_stream_is_not_plural() -> None:
-    assert (plural(1, "stream"), plural(1200, "stream")) == ("1 stream", "1,200 streams")
+def test_quantities_are_written_with_their_unit(written: str, text: str) -> None:
+    assert written == text
 
 
 values = st.recursive(
@@ -181,7 +179,7 @@ def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
         assert watch is not None
         watch(Status("running", operators={"smooth": OperatorCounts(3)}))
 
-    assert console.file.getvalue().split() == ["running", "3", "firings"]  # type: ignore[attr-defined]
+    assert console.file.getvalue().split() == ["running", "3", "firings"]
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -192,7 +190,7 @@ def test_notes_are_printed_as_they_come_each_once_and_not_those_of_the_end(quiet
         watch(status)
         status.notes.append("source 'robot' has fallen behind the clock: reading it takes longer than real time")
         watch(status)
-        at_once = console.file.getvalue()  # type: ignore[attr-defined]
+        at_once = console.file.getvalue()
         watch(status)
         status.phase = "closing"
         status.notes.append("source 'robot' was 15.0 s behind the clock at the end, 16.0 s at most")
@@ -200,8 +198,13 @@ def test_notes_are_printed_as_they_come_each_once_and_not_those_of_the_end(quiet
 
     note = "note: source 'robot' has fallen behind the clock: reading it takes longer than real time"
     assert note in at_once.splitlines()
-    whole = console.file.getvalue()  # type: ignore[attr-defined]
+    whole = console.file.getvalue()
     assert whole.count("behind the clock") == 1
+
+
+def text_of(console: Console) -> list[str]:
+    """The lines that were printed."""
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
 
 
 def lossy_report() -> RunReport:
@@ -227,12 +230,12 @@ def lossy_report() -> RunReport:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_a_report_tells_drops_timeouts_and_late_messages_apart(width: int) -> None:
+def test_report_distinguishes_drops_timeouts_and_late_messages(width: int) -> None:
     console = Console(file=io.StringIO(), width=width)
 
     print_report(console, lossy_report(), verbose=True)
 
-    lines = [text.rstrip() for text in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+    lines = text_of(console)
     assert max(map(len, lines)) <= width
     told = [text.split() for text in lines]
     headings = "operator firings out Hz dropped timeouts late CPU s ms each wall s"
@@ -252,7 +255,7 @@ def test_a_report_without_losses_has_no_columns_for_them() -> None:
 
     print_report(console, replace(report, operators=counts, drops={}, waits={}), verbose=True)
 
-    told = console.file.getvalue()  # type: ignore[attr-defined]
+    told = console.file.getvalue()
     assert "dropped" not in told
     assert "timeout" not in told
 
@@ -260,13 +263,7 @@ def test_a_report_without_losses_has_no_columns_for_them() -> None:
 def printed(report: RunReport, width: int = 200) -> list[str]:
     console = Console(file=io.StringIO(), width=width)
     print_report(console, report, verbose=False)
-    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
-
-
-def test_findings_stand_among_the_first_lines() -> None:
-    summaries = {"check": {"pairs": 9, "finding": "the camera is displaced by 2 cm"}, "odometry": {"frames": 9}}
-    lines = printed(replace(lossy_report(), summaries=summaries))
-    assert "found   check: the camera is displaced by 2 cm" in lines[:4]
+    return text_of(console)
 
 
 def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
@@ -300,26 +297,27 @@ def test_parts_of_the_runtime_are_called_what_they_are() -> None:
     assert waiting_for(status) == "waiting for recording, odometry, recorder"
 
 
-def test_a_miss_is_no_loss() -> None:
-    assert "lost    nothing" in printed(replace(lossy_report(), drops={"fusion": (("image", "unmatched", 12),)}))
+def lacking(messages: int, firings: int, *spans: list[int | None]) -> dict[str, Any]:
+    """The files of a recorder whose disk was full."""
+    lost = {"messages": messages, "firings": firings, "spans": spans, "reasons": ["a.mcap: no space"], "streams": {}}
+    return {"@recorder": {"path": "a.mcap", "messages": 9, "bytes": 5_000_000, "lost": lost}}
 
 
-def test_what_a_recording_lacks_is_among_the_losses() -> None:
-    lost = {"messages": 7, "firings": 3, "spans": [[2 * 10**9, None]], "reasons": ["a.mcap: no space"], "streams": {}}
-    facts = {"path": "a.mcap", "messages": 9, "bytes": 5_000_000, "lost": lost}
-
-    lines = printed(replace(lossy_report(), drops={}, files={"@recorder": facts}))
-
-    assert "lost    7 messages and 3 calls not recorded, from 2.000000000s to the end (a.mcap: no space)" in lines
-
-
-def test_a_file_without_its_end_is_among_the_losses() -> None:
-    lost = {"messages": 0, "firings": 0, "spans": [], "reasons": ["a.mcap: no space"], "streams": {}}
-    facts = {"path": "a.mcap", "messages": 9, "bytes": 5_000_000, "lost": lost}
-
-    assert "lost    the end of a file (a.mcap: no space)" in printed(
-        replace(lossy_report(), drops={}, files={"@recorder": facts})
-    )
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({"summaries": {"check": {"n": 9, "finding": "displaced by 2 cm"}}}, "found   check: displaced by 2 cm"),
+        ({"drops": {"fusion": (("image", "unmatched", 12),)}}, "lost    nothing"),  # a miss is no loss
+        (
+            {"drops": {}, "files": lacking(7, 3, [2 * 10**9, None])},
+            "lost    7 messages and 3 calls not recorded, from 2.000000000s to the end (a.mcap: no space)",
+        ),
+        ({"drops": {}, "files": lacking(0, 0)}, "lost    the end of a file (a.mcap: no space)"),
+        ({"notes": ("late", "late")}, "note: late"),
+    ],
+)
+def test_summary_has_findings_losses_and_notes_once(changed: dict[str, Any], line: str) -> None:
+    assert printed(replace(lossy_report(), **changed)).count(line) == 1
 
 
 def test_what_a_flight_recorder_could_not_keep_is_among_the_losses() -> None:
@@ -336,10 +334,6 @@ def test_what_a_flight_recorder_could_not_keep_is_among_the_losses() -> None:
     assert not any(line.startswith("kept    b.mcap") for line in lines)
     assert is_lacking(facts)
     assert not is_lacking({**facts, "kept": [kept]})
-
-
-def test_a_note_is_printed_once() -> None:
-    assert printed(replace(lossy_report(), notes=("late", "late"))).count("note: late") == 1
 
 
 def test_the_json_report_has_cpu_and_wall_time() -> None:
@@ -368,47 +362,37 @@ def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkey
         ("KeyError: 'a'", False),
     ],
 )
-def test_an_error_about_a_file_is_told_by_its_class(last: str, file: bool) -> None:
+def test_file_errors_are_recognised_by_class(last: str, file: bool) -> None:
     trace = f'Traceback (most recent call last):\n  File "x.py", line 1, in setup\n    read()\n    ^^^^^^\n{last}\n'
 
     assert about_a_file(trace) is file
     assert not about_a_file(last)
 
 
-def test_an_operator_that_fails_when_it_is_called_again_is_no_internal_error(capsys) -> None:
+@pytest.mark.parametrize(
+    ("error", "code", "told"),
+    [
+        (OperatorFailure("odometry", "setup()", KeyError("gain")), 2, "error: operator 'odometry' failed in setup(): "),
+        (RunFailed("stopped before everything was drained", interrupted=True), 130, "stopped before everything was"),
+    ],
+)
+def test_expected_errors_end_with_their_exit_code(capsys, error: Exception, code: int, told: str) -> None:
     with pytest.raises(typer.Exit) as ended, friendly_errors():
-        raise OperatorFailure("odometry", "setup()", KeyError("gain"))
+        raise error
 
-    assert ended.value.exit_code == 2
-    assert "error: operator 'odometry' failed in setup(): KeyError: 'gain'" in capsys.readouterr().err
-
-
-def test_an_interruption_is_no_error(capsys) -> None:
-    with pytest.raises(typer.Exit) as ended, friendly_errors():
-        raise RunFailed("stopped before everything was drained", interrupted=True)
-
-    assert ended.value.exit_code == 130
-    assert capsys.readouterr().err == "stopped before everything was drained\n"
+    assert ended.value.exit_code == code
+    assert capsys.readouterr().err.startswith(told)
 
 
-def test_a_start_says_which_processes_it_waits_for() -> None:
+def test_start_names_processes_it_waits_for() -> None:
     status = Status(waiting=("camera", "cloud", "detector", "odometry", "@recorder"))
     console = Console(file=io.StringIO(), width=100)
     with shown(console, RunDisplay(console), quiet=False) as watch:
         assert watch is not None
         watch(status)
 
-    assert console.file.getvalue().split() == [
-        "starting",
-        "waiting",
-        "for",
-        "camera,",
-        "cloud,",
-        "detector",
-        "and",
-        "2",
-        "more",
-    ]
+    waiting = "starting waiting for camera, cloud, detector and 2 more"
+    assert " ".join(console.file.getvalue().split()) == waiting
 
 
 def test_a_line_break_in_a_name_makes_no_row() -> None:
@@ -418,6 +402,6 @@ def test_a_line_break_in_a_name_makes_no_row() -> None:
 
     console.print(made)
 
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    lines = console.file.getvalue().splitlines()
     assert [line for line in lines if "forged" in line] == [line for line in lines if "imu" in line]
     assert any("3\\n4" in line for line in lines)

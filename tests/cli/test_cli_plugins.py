@@ -87,7 +87,7 @@ def test_the_help_lists_them_and_the_broken_ones_with_their_error() -> None:
     ("command", "message"),
     [("raises", "RuntimeError: no licence"), ("absent", "AttributeError"), ("number", "expected a typer.Typer")],
 )
-def test_a_broken_one_says_why_and_could_not_run(command: str, message: str) -> None:
+def test_broken_plugin_reports_reason_and_exits_with_2(command: str, message: str) -> None:
     told = CliRunner().invoke(app, [command, "--anything", "x"])
 
     assert told.exit_code == 2

@@ -110,30 +110,6 @@ def test_a_recording_is_saved_for_the_viewer(dataflow, recorded, tmp_path: Path)
     assert "replace it with --overwrite" in dataflow("view", recorded[0], "--to", saved, code=2).stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "there is no display"),
-        (["--to", "window"], "expected spawn, serve"),
-        (["--to", "rerun+http://127.0.0.1:9/proxy"], "no viewer listens"),
-        (["--to", "x.rrd", "--stream", "left/fats"], "did you mean 'left/fast'?"),
-        (["--to", "x.rrd", "--stream", "left/fast", "--start", "7"], "ends 0.29 s after"),
-        (["--to", "x.rrd", "--graph", "small"], "running graph"),
-    ],
-)
-def test_a_view_that_cannot_be_is_refused(
-    dataflow, recorded, tmp_path: Path, monkeypatch, words: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    assert message in dataflow("view", recorded[0], *words, code=2).stderr
-    assert not Path("x.rrd").exists()
-
-
-def test_a_missing_recording_is_told_before_a_missing_display(dataflow, tmp_path: Path) -> None:
-    assert "no file" in dataflow("view", tmp_path / "run.mcap", code=2).stderr
-
-
 def test_a_recording_that_nothing_can_be_drawn_of_is_refused(dataflow, data_dir: Path, tmp_path: Path) -> None:
     foreign = data_dir / "bags" / "ros2_cdr_test.mcap"
 

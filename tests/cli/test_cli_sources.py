@@ -49,7 +49,7 @@ def poses(
             data = json.dumps({"timestamp": stamp, "frame_id": "map", "pose": place}).encode()
             writer.add_message(pose, time, text if i == bad else data, time, i)
             writer.add_message(other, time, b'{"number": %d, "text": "%s"}' % (i, b"abcdefgh" * 10), time, i)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path
 
 
@@ -179,12 +179,7 @@ CHUNKS = (damaged_chunk, wrong_checksum, unknown_compression)
 )
 @pytest.mark.long
 def test_every_command_takes_damage_in_one_way(
-    dataflow,
-    tmp_path: Path,
-    make: Callable[[Path], Path],
-    code: int,
-    file_code: int,
-    said: str,
+    dataflow, tmp_path: Path, make: Callable[[Path], Path], code: int, file_code: int, said: str
 ) -> None:
     """0: nothing is missing; 1: what is there is used, what is missing is said; 2: nothing can be used. `info`
     describes a file, and does not read its chunks; `diff` compares what both hold; `lint` finds any damage."""
@@ -202,6 +197,30 @@ def test_every_command_takes_damage_in_one_way(
             words[0] != "info" or make not in (damaged_chunk, wrong_checksum, unknown_compression)
         ):
             assert said in " ".join((told.stdout + told.stderr).split()), words
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "convert FILE OUT.mcap --to mcap --clock log --json",
+        "convert FILE OUT --to csv --clock log --json",
+        "convert FILE OUT --to ros2 --stream /pose --json",
+        "lint FILE --json",
+        "cut FILE -o OUT.mcap --from 0 --json",
+        "filter FILE -o OUT.mcap --stream /pose --json",
+    ],
+)
+def test_damaged_chunk_is_passed_over_and_counted_unless_strict(dataflow, tmp_path: Path, words: str) -> None:
+    path = damaged_chunk(tmp_path / "a.mcap")
+    places = {"FILE": path} | {name: tmp_path / name for name in ("OUT", "OUT.mcap", "OTHER", "OTHER.mcap")}
+
+    done = dataflow(*(places.get(word, word) for word in words.split()), code=1)
+
+    assert "12 messages lost to damage" in done.stdout + done.stderr
+    assert "chunk 2 at byte" in done.stdout
+    if words.startswith("convert"):
+        strict = (places.get(word, word) for word in words.replace("OUT", "OTHER").split())
+        assert "chunk 2 at byte" in dataflow(*strict, "--strict", code=2).stderr
 
 
 @pytest.mark.parametrize("make", [damaged_chunk, bad_message])
@@ -293,7 +312,7 @@ def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Pat
             for k in range(3):
                 data = b"\xff\xff\xff\x7f" if k == 1 else struct.pack("<I", 2) + b"hi"
                 writer.add_message(channel, START + k * SECOND, data, START + k * SECOND, k)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
 
     told = json.loads(dataflow("convert", path, tmp_path / "bag", "--to", "ros2", "--json").stdout)
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from foreign_mcap import foreign_mcap
 from rich.text import Text
 
 from dataflow.cli.app import call
@@ -58,7 +59,7 @@ def test_ctrl_c_while_something_is_imported_is_no_error(small: Path, module: str
     assert told.stdout == ""
 
 
-def test_ctrl_c_that_a_library_has_wrapped_into_an_error_is_none(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_wrapped_keyboard_interrupt_is_an_interrupt(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def interrupted() -> None:
         try:
             raise KeyboardInterrupt
@@ -147,17 +148,14 @@ def test_control_characters_never_reach_a_terminal(monkeypatch: pytest.MonkeyPat
 
 
 def test_names_in_a_recording_are_shown_without_their_escapes(dataflow, tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    path = tmp_path / "escape.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="[bold]p\x1b[2J", library="\x1b]0;owned\x07")
-        schema = writer.register_schema("s\x1b[31m", "jsonschema", b"{}")
-        channel = writer.register_channel("/a\x1b[2J/[red]x", "json", schema)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.add_metadata("recording", {"namespace": "\x9b2J"})
-        writer.finish()
+    path = foreign_mcap(
+        tmp_path / "escape.mcap",
+        [("/a\x1b[2J/[red]x", 1, b"{}")],
+        profile="[bold]p\x1b[2J",
+        library="\x1b]0;owned\x07",
+        schema="s\x1b[31m",
+        metadata={"recording": {"namespace": "\x9b2J"}},
+    )
     for words in (["info", path], ["info", path, "--metadata"], ["info", path, "--json"], ["diff", path, path]):
         told = dataflow(*words)
         for text in (told.stdout, told.stderr):
@@ -168,15 +166,7 @@ def test_names_in_a_recording_are_shown_without_their_escapes(dataflow, tmp_path
 
 
 def test_a_name_of_a_million_characters_is_cut_and_the_rest_counted(dataflow, tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    path = tmp_path / "long.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/" + "x" * 1_000_000, "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.finish()
+    path = foreign_mcap(tmp_path / "long.mcap", [("/" + "x" * 1_000_000, 1, b"{}")])
     for words in (["info", path], ["diff", path, path]):
         told = dataflow(*words)
         assert told.exit_code == 0
@@ -185,15 +175,7 @@ def test_a_name_of_a_million_characters_is_cut_and_the_rest_counted(dataflow, tm
 
 
 def test_diff_leaves_logs_out(dataflow, tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
     for name, text in (("a.mcap", b'{"text": "1 ms"}'), ("b.mcap", b'{"text": "2 ms"}')):
-        with (tmp_path / name).open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            schema = writer.register_schema("s", "jsonschema", b"{}")
-            for topic, data in (("/result", b"{}"), ("/@/logs", text)):
-                writer.add_message(writer.register_channel(topic, "json", schema), 1, data, 1)
-            writer.finish()
+        foreign_mcap(tmp_path / name, [("/result", 1, b"{}"), ("/@/logs", 1, text)], schema="s")
 
     assert dataflow("diff", tmp_path / "a.mcap", tmp_path / "b.mcap").exit_code == 0

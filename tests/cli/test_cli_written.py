@@ -45,13 +45,6 @@ def test_a_replay_is_recorded_with_the_compression_that_is_asked_for(
     dataflow("diff", recorded[0], path)
 
 
-@pytest.mark.parametrize("command", ["run", "replay"])
-def test_a_compression_of_nothing_is_refused(dataflow, small: Path, recorded: Recorded, command: str) -> None:
-    file = small if command == "run" else recorded[0]
-    assert "name one with --record" in dataflow(command, file, "--compression", "lz4", code=2).stderr
-    assert "'gzip' is not one of" in dataflow(command, file, "--compression", "gzip", code=2).stderr
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [("cut", ["--to", "1"]), ("filter", ["--stream", "left/*"]), ("recover", []), ("split", ["--every", "10s"])],

@@ -39,7 +39,7 @@ def test_a_recording_that_failed_is_named_with_side_reason_and_output(tmp_path: 
     assert list(_failed_lines(found)) == [f"failed: a.mcap by B: no end (its output: {log})"]
 
 
-def test_what_failed_alike_by_both_is_one_line_and_what_was_not_done_is_said(tmp_path: Path) -> None:
+def test_equal_failures_of_both_sides_are_one_line(tmp_path: Path) -> None:
     both = result("a0", "error: no MCAP file", "1"), result("a1", "error: no MCAP file", "2")
 
     found = _failed(plan(tmp_path, {"a": both, "b": (result("b0"), None)}))

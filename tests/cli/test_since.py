@@ -53,7 +53,7 @@ def test_the_report_names_what_changed_or_that_all_is_as_recorded(
     assert sentence in said(more, **of)
 
 
-def test_where_no_cause_was_found_and_all_is_as_recorded_nothing_is_said_to_have_changed() -> None:
+def test_unchanged_operator_is_reported_as_recorded() -> None:
     [line] = _lines(Why("x", repeats=True, code_known=True, reruns=4))
 
     assert (
@@ -68,7 +68,7 @@ def test_files_that_have_an_effect_and_are_older_than_the_recording_are_named() 
     assert lines[1] == "x: its results also depend on file /etc/gain, older than the recording"
 
 
-def test_without_a_culprit_it_is_said_that_there_is_nothing_to_look_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_culprit_no_causes_are_looked_for(capsys: pytest.CaptureFixture[str]) -> None:
     report = VerifyReport((Verification("x", firings=1, verified=1),), (), (), 1, 1, 1.0, 1.0)
 
     assert _reasons(Checked(Path("run.mcap"), "run", report), None, None) == []

@@ -50,7 +50,7 @@ def status(
     return ProcessStatus(process, counts, dict.fromkeys(counts, restarts), through, waits or {}, behind or {})
 
 
-def test_the_board_follows_operators_from_answer_to_answer() -> None:
+def test_status_table_follows_operators_between_answers() -> None:
     table = StatusTable(graph_with("camera", "detector", "planner"))
     table.update(
         [status("eyes", camera=(10, 10, 0, 0, 10**9, 0)), status("brain", detector=(0, 0, 0, 0, NEVER, 0))], 1.0
@@ -70,7 +70,7 @@ def test_the_board_follows_operators_from_answer_to_answer() -> None:
     assert (planner.state, planner.process, planner.lag) == ("no answer", "", None)
 
 
-def test_the_board_keeps_the_last_counts_of_a_process_that_is_away_and_takes_up_its_successor() -> None:
+def test_status_table_keeps_counts_of_a_silent_process() -> None:
     table = StatusTable(graph_with("camera"))
     table.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
 
@@ -164,7 +164,7 @@ def test_lines_stand_under_their_heading() -> None:
         assert len(text) <= len(top)
 
 
-def test_what_an_operator_found_wrong_is_among_the_notes() -> None:
+def test_findings_of_operators_are_among_the_notes() -> None:
     table = StatusTable(graph_with("camera", "check"))
     found = {"check": "edges of colour and depth did not fit"}
     counts = dict.fromkeys(("camera", "check"), (1, 1, 0, 0, 10**9, 0))
@@ -200,7 +200,7 @@ def test_an_operator_that_hangs_in_its_first_call_is_named(seconds: float, named
     assert list(silent(load_text(CHAIN), [status], running=100.0, over=2.0)) == named
 
 
-def test_a_clock_of_another_machine_that_was_not_measured_has_no_figure() -> None:
+def test_unmeasured_clock_of_another_machine_has_no_figure() -> None:
     assert machine_line("robot", MachineStatus(False, 0, 0, 0)) == "machine robot: link down, clock not measured yet"
     assert machine_line("robot", MachineStatus(True, 1_250_000, 600_000, 2)) == (
         "machine robot: link up, clock +1.250 ms ± 0.300 ms, 2 messages dropped"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from dataflow.cli.support.storage import named, recording_file, splitting_of, storage_of
+from dataflow.cli.support.storage import RecordOptions, named, recording_file, splitting_of
 from dataflow.recording.parts import Splitting
 
 
@@ -49,14 +49,20 @@ def test_a_limit_of_the_disk_splits_by_a_tenth_of_it(capsys: pytest.CaptureFixtu
     assert "less than two files" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--split-every", "--split-size", "--keep-disk", "--record-failure"])
-def test_options_of_a_recording_need_one(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = {"--split-every": "1s", "--split-size": "1MB", "--keep-disk": "1MB", "--record-failure": "end"}
-    given = [words[name] if name == option else None for name in words]
-
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("split_every", "1s"),
+        ("split_size", "1MB"),
+        ("keep_disk", "1MB"),
+        ("record_failure", "end"),
+        ("compression", "lz4"),
+    ],
+)
+def test_options_of_a_recording_need_one(name: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit):
-        storage_of(None, *given, "owner")  # type: ignore[arg-type]
-    assert f"{option} is of a recording" in capsys.readouterr().err
+        RecordOptions(**{name: value}).storage()
+    assert f"--{name.replace('_', '-')} is of a recording" in capsys.readouterr().err
 
 
 @pytest.mark.long

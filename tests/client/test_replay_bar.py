@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dataflow.client.attach import NotRunning
-from dataflow.client.replay_bar import ReplayBar
+from dataflow.client.playback import ReplayBar
 
 FIRST = 1_700_000_000 * 10**9
 
@@ -42,7 +42,7 @@ def replay() -> Replay:
 
 @pytest.fixture
 def bar(replay: Replay) -> ReplayBar:
-    return ReplayBar(replay, replay.ask(None))  # type: ignore[arg-type]
+    return ReplayBar(replay, replay.ask(None))
 
 
 def test_it_pauses_and_goes_on_without_changing_a_speed_that_was_not_touched(replay: Replay, bar: ReplayBar) -> None:

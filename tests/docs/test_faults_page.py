@@ -37,7 +37,7 @@ SHOWN_BY = {
         a_process_that_leaks_past_its_limit_is_started_again
         without_a_policy_a_leak_ends_the_run_before_the_machine_does
     """,
-    "an operator is slow": "a_slow_operator_drops_by_its_policy_and_holds_up_nobody",
+    "an operator is slow": "slow_operator_drops_by_policy_without_delaying_others",
     "a process gives no sign of life (stopped, swapped out)": """
         a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy
         stopped_consumer_is_not_waited_for_and_starts_a_new_backlog
@@ -51,7 +51,7 @@ SHOWN_BY = {
         a_time_in_which_the_process_was_stopped_is_no_part_of_a_call
     """,
     "the process that starts the others (the nursery) is killed": """
-        a_run_whose_nursery_is_killed_says_so_and_leaves_no_process
+        killed_nursery_fails_the_run_and_leaves_no_process
     """,
     "several faults at random": "a_run_under_faults_of_every_kind_is_verified_in_the_other_placement",
     "a source crashes, or a live source raises (an unplugged camera)": """
@@ -77,7 +77,7 @@ SHOWN_BY = {
         a_source_whose_stamps_jumped_far_ahead_is_named
     """,
     "a message has a stamp in the past": """
-        a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody
+        past_stamps_and_malformed_outside_messages_are_dropped
     """,
     "the disk is full while recording": """
         a_full_disk_stops_the_recording_until_it_has_room_and_never_the_run
@@ -90,9 +90,9 @@ SHOWN_BY = {
         a_viewer_that_is_killed_is_not_missed
         a_stopped_viewer_costs_nothing_and_loses_nothing
     """,
-    "a Zenoh subscriber outside the run is slow or stopped": "a_slow_subscriber_from_outside_costs_nobody_anything",
+    "a Zenoh subscriber outside the run is slow or stopped": "slow_outside_subscriber_does_not_delay_the_run",
     "another program publishes on a key of the run, malformed or forged": """
-        a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody
+        past_stamps_and_malformed_outside_messages_are_dropped
         forged_ends_frontiers_and_messages_change_nothing
     """,
     "an envelope contradicts its stream": """

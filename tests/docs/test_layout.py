@@ -18,17 +18,6 @@ MOST_ARROWS_IN_ODOMETRY = 40
 CIRCULAR = ("dataflow.cli",)
 """Rooms whose folders import each other."""
 MOST_LINES = 60
-LONG = {
-    "dataflow.cli.commands.convert:convert": 92,
-    "dataflow.cli.commands.replay:replay": 135,
-    "dataflow.cli.commands.run:run": 103,
-    "dataflow.cli.commands.verification:verify": 86,
-    "operators.scene.map.cuboid:fit_cuboid": 81,
-}
-"""Functions of more than `MOST_LINES` lines, with their lines. The list only gets shorter, and its numbers smaller.
-
-Of the commands, options and help make the lines: their bodies have at most 53.
-"""
 
 
 def allowed(repository: Path) -> dict[str, tuple[str, ...]]:
@@ -196,10 +185,7 @@ def test_functions_are_short(repository: Path) -> None:
         for function, lines in lines_of_functions(nodes_of(file)[0], f"{module_of(file, repository)}:")
         if lines > MOST_LINES
     }
-    longer = {function: lines for function, lines in long.items() if lines > LONG.get(function, MOST_LINES)}
-    assert not longer, f"longer than {MOST_LINES} lines, or than the list of long functions allows: {longer}"
-    shorter = {function: long.get(function) for function in LONG if long.get(function) != LONG[function]}
-    assert not shorter, f"take these off the list of long functions, or write down that they are shorter: {shorter}"
+    assert not long, f"functions of more than {MOST_LINES} lines: {long}"
 
 
 def test_collecting_tests_imports_no_library_that_takes_seconds(imported_by_collection: set[str]) -> None:

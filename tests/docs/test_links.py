@@ -28,7 +28,7 @@ PROGRAM = typer.main.get_command(app)
 @functools.cache
 def all_commands() -> dict[str, Any]:
     """The commands of the engine, and those of perception, which it finds by entry points."""
-    commands = dict(PROGRAM.commands)  # type: ignore[attr-defined]
+    commands = dict(PROGRAM.commands)
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for name, value in project["entry-points"]["dataflow.commands"].items():
         module, _, attribute = value.partition(":")

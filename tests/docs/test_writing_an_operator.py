@@ -67,7 +67,7 @@ def test_its_operator_works_in_that_chain(my_robot: Any) -> None:
     assert len(nearest) == 3
     for point in nearest:
         assert isinstance(point, Point)
-        assert point.frame == cloud["cloud"][0].frame  # type: ignore[attr-defined]
+        assert point.frame == cloud["cloud"][0].frame
         assert 0.3 < float((point.position**2).sum() ** 0.5) < 2.5  # the table stands within reach of the whole path
 
 

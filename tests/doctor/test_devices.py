@@ -72,7 +72,7 @@ def test_the_lines_of_a_device_are_those_of_a_source(tmp_path: Path) -> None:
         assert source.input == device.path
 
 
-def test_a_device_that_this_user_cannot_read_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_without_read_permission_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine(tmp_path)
     monkeypatch.setattr(os, "access", lambda file, mode: False)
 
@@ -107,7 +107,7 @@ def test_the_command_prints_them_for_people_and_programs(tmp_path: Path, monkeyp
     ]
 
 
-def test_a_machine_without_devices_is_named_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machine_without_devices_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = find_devices(tmp_path)
     monkeypatch.setattr(devices, "find_devices", lambda: nothing)
     people, programs = (CliRunner().invoke(app, ["devices", *more]) for more in ([], ["--json"]))

@@ -37,7 +37,7 @@ def test_versions_are_compared_with_their_bounds(installed: str, bounds: str, br
     assert unmet(installed, bounds) == broken
 
 
-def test_missing_and_old_packages_are_told_from_missing_extras() -> None:
+def test_missing_packages_are_distinguished_from_missing_extras() -> None:
     def version(name: str) -> str:
         if name in ("gone", "also-gone", "open3d"):
             raise PackageNotFoundError(name)
@@ -72,7 +72,7 @@ def test_a_module_that_does_not_load_is_named_with_the_reason(tmp_path: Path, mo
     assert not [f for f in check_loading({"torch": "missing"}) if f.state is not State.OK]
 
 
-def test_a_library_that_ends_the_process_is_told(tmp_path: Path, monkeypatch) -> None:
+def test_library_that_ends_the_process_is_reported(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "ends_it.py").write_text("import os; os._exit(7)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert "exit code 7" in load(("ends_it",))["libraries"]

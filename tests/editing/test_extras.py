@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from foreign_mcap import foreign_mcap
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment
-from mcap.writer import Writer
 
 from dataflow.editing.merge import merge
 from dataflow.editing.part import Part, write_part
@@ -35,18 +35,9 @@ NOTES = ("notes", "text/plain", 8, 0, b"")
 
 
 def foreign(path: Path, topic: str, attachments: list[tuple[str, str, int, int, bytes]], **metadata: str) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="another program")
-        channel = writer.register_channel(topic, "json", 0)
-        for name, media, log_time, created, data in attachments:
-            writer.add_attachment(created, log_time, name, media, data)
-        for k in range(10):
-            writer.add_message(channel, 1000 + k, b"%d" % k, 1000 + k, k)
-        for name, value in metadata.items():
-            writer.add_metadata(name, {"value": value})
-        writer.finish()
-    return path
+    messages = [(topic, 1000 + k, b"%d" % k) for k in range(10)]
+    records = {name: {"value": value} for name, value in metadata.items()}
+    return foreign_mcap(path, messages, metadata=records, attachments=attachments)
 
 
 def ours(path: Path, attachments: list[tuple[str, str, int, int, bytes]], **metadata: str) -> Path:
@@ -65,7 +56,7 @@ def held(path: Path) -> Extras:
     """What the mcap library reads, by the summary."""
     with path.open("rb") as file:
         reader = make_reader(file)
-        statistics = reader.get_summary().statistics  # type: ignore[union-attr]
+        statistics = reader.get_summary().statistics
         found = [(a.name, a.media_type, a.log_time, a.create_time, a.data) for a in reader.iter_attachments()]
         records = [(m.name, dict(m.metadata)) for m in reader.iter_metadata()]
     assert statistics is not None
@@ -170,7 +161,7 @@ def test_the_records_of_a_later_run_do_not_pass_for_those_of_the_first(tmp_path:
         assert "b/recording" in origin.metadata
 
 
-def test_an_attachment_that_fails_its_checksum_is_left_out_and_said(tmp_path: Path) -> None:
+def test_attachment_with_wrong_checksum_is_left_out_and_reported(tmp_path: Path) -> None:
     path = foreign(tmp_path / "a.mcap", "/said", [CALIBRATION, NOTES])
     path.write_bytes(path.read_bytes().replace(b"fx: 500", b"fx: 501"))
 
@@ -189,14 +180,14 @@ def test_a_torn_file_gives_the_attachments_that_are_whole(tmp_path: Path) -> Non
     Attachment(0, 0, "late", "text/plain", b"x" * 100).write(record)
     at = data.index(b"calibration.yaml")
     torn = tmp_path / "torn.mcap"
-    torn.write_bytes(data[: data.index(struct.pack("<B", Opcode.DATA_END), at + 60)] + bytes(record.end())[:50])  # type: ignore[no-untyped-call]
+    torn.write_bytes(data[: data.index(struct.pack("<B", Opcode.DATA_END), at + 60)] + bytes(record.end())[:50])
 
     saved = recover(torn, tmp_path / "saved.mcap")
     assert saved.torn
     assert held(tmp_path / "saved.mcap")[0] == [CALIBRATION]
 
 
-def test_one_that_is_too_large_is_left_out_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_attachment_is_left_out_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = foreign(tmp_path / "a.mcap", "/said", [CALIBRATION, ("map", "image/png", 0, 0, bytes(2000))])
     monkeypatch.setattr(attachment_module, "MAX_CHUNK_BYTES", 1000)
 

@@ -76,11 +76,7 @@ def latency(number: int, _: Path, graph: Graph) -> int:
 
 @pytest.mark.parametrize(("work", "share"), [(cut, 4), (joined, 1), (latency, 1)], ids=["cut", "merge", "latency"])
 def test_memory_hardly_grows_with_the_length_of_a_run(
-    work: Callable[[int, Path, Graph], int],
-    share: int,
-    tmp_path: Path,
-    graph: Graph,
-    monkeypatch: pytest.MonkeyPatch,
+    work: Callable[[int, Path, Graph], int], share: int, tmp_path: Path, graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dataflow.analysis.latency.KEPT", 256)
     work(100, tmp_path, graph)  # what is loaded on the way
@@ -111,7 +107,7 @@ def test_each_part_of_a_run_reads_little_more_than_its_own_records() -> None:
         read[0], each = 0, 8192 // parts
         for k in range(parts):
             start, end = k * each + 1, (k + 1) * each
-            found = run.of_span({"test/left/fast"}, start, end, lambda _, span=(start, end): span)  # type: ignore[misc]
+            found = run.of_span({"test/left/fast"}, start, end, lambda _, span=(start, end): span)
             assert sum(record.kind == "fire" for record in found.records["left"]) == each
         counts.append(read[0])
     assert counts[1] < 2 * counts[0]

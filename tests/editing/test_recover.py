@@ -6,10 +6,10 @@ import random
 from pathlib import Path
 
 import pytest
+from foreign_mcap import foreign_mcap
 from made_parts import messages
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from dataflow.editing.recover import recover
 from dataflow.messages import Text
@@ -95,14 +95,8 @@ def test_a_sound_file_is_saved_whole(tmp_path: Path) -> None:
 
 
 def test_a_time_before_the_epoch_is_saved_as_it_is(tmp_path: Path) -> None:
-    path, out = tmp_path / "early.mcap", tmp_path / "out.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/x", "json", 0)
-        for time in (5, 2**64 - 1, 2**63):
-            writer.add_message(channel, time, b"{}", time)
-        writer.finish()
+    out = tmp_path / "out.mcap"
+    path = foreign_mcap(tmp_path / "early.mcap", [("/x", time, b"{}") for time in (5, 2**64 - 1, 2**63)])
 
     recover(path, out)
 

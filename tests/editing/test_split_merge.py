@@ -49,7 +49,7 @@ def merged(paths: list[Path], out: Path, *prefixes: str) -> list[str]:
 @pytest.mark.parametrize("how", [{"every": SECOND // 4}, {"size": 20_000}], ids=["time", "size"])
 def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: dict[str, int]) -> None:
     with Origin(recorded) as origin:
-        parts = [Path(done.path) for done in split(origin, tmp_path / "parts", **how)]  # type: ignore[arg-type]
+        parts = [Path(done.path) for done in split(origin, tmp_path / "parts", **how)]
 
     merged(list(reversed(parts)), tmp_path / "whole.mcap")
 
@@ -93,12 +93,12 @@ def test_messages_are_decoded_for_the_part_that_they_are_in(tmp_path: Path, monk
 
 def test_every_message_is_in_the_part_of_its_time(recorded: Path, tmp_path: Path) -> None:
     with Origin(recorded) as origin:
-        first, last = origin.span()  # type: ignore[misc]
+        first, last = origin.span()
         done = list(split(origin, tmp_path / "parts", every=SECOND // 3))
 
     spans = [one.span for one in done]
-    assert all(b[0] > a[1] for a, b in pairwise(spans))  # type: ignore[index]
-    assert (spans[0][0], spans[-1][1]) == (first, last)  # type: ignore[index]
+    assert all(b[0] > a[1] for a, b in pairwise(spans))
+    assert (spans[0][0], spans[-1][1]) == (first, last)
 
 
 @pytest.mark.long
@@ -181,7 +181,7 @@ def test_streams_of_another_recording_join_a_run_that_still_verifies(stateful: P
     }
 
 
-def test_a_filtered_recording_says_what_it_cannot_verify(recorded: Path, tmp_path: Path) -> None:
+def test_filtered_recording_reports_unverifiable_operators(recorded: Path, tmp_path: Path) -> None:
     with Origin(recorded) as origin:
         names = [name for name in origin.counts() if not name.startswith("test/right/")]
         write_part(origin, Part(streams=names), tmp_path / "part.mcap")

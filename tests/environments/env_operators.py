@@ -31,7 +31,7 @@ class Gain(Operator):
     y: Out[FeatureVector]
 
     def setup(self) -> None:
-        import tiny  # type: ignore[import-not-found]
+        import tiny
 
         self.gain = tiny.GAIN
 

@@ -21,11 +21,19 @@ def sha256(folder: Path) -> str:
     return hashlib.sha256((folder / "wheels" / "tiny-1.0-py3-none-any.whl").read_bytes()).hexdigest()
 
 
-@pytest.mark.long
-def test_an_environment_is_built_from_its_requirements_and_again_from_its_lock(tmp_path: Path) -> None:
+@pytest.fixture
+def requirements(tmp_path: Path) -> Path:
+    """Requirements of a package whose version 1.0 lies beside them."""
     wheel(tmp_path / "wheels", "1.0", 2.0)
-    requirements = tmp_path / "gains.txt"
-    requirements.write_text(f"--no-index\n--find-links {tmp_path / 'wheels'}\ntiny\n")
+    path = tmp_path / "gains.txt"
+    path.write_text(f"--no-index\n--find-links {tmp_path / 'wheels'}\ntiny\n")
+    return path
+
+
+@pytest.mark.long
+def test_an_environment_is_built_from_its_requirements_and_again_from_its_lock(
+    requirements: Path, tmp_path: Path
+) -> None:
     module = packages(tmp_path / "gains.env") / "tiny.py"
 
     assert build(requirements)
@@ -48,10 +56,7 @@ def test_an_environment_is_built_from_its_requirements_and_again_from_its_lock(t
 
 
 @pytest.mark.long
-def test_another_file_of_the_same_version_is_refused(tmp_path: Path) -> None:
-    wheel(tmp_path / "wheels", "1.0", 2.0)
-    requirements = tmp_path / "gains.txt"
-    requirements.write_text(f"--no-index\n--find-links {tmp_path / 'wheels'}\ntiny\n")
+def test_another_file_of_the_same_version_is_refused(requirements: Path, tmp_path: Path) -> None:
     build(requirements)
     locked = sha256(tmp_path)
     (tmp_path / "gains.env" / "built.lock").unlink()
@@ -68,12 +73,9 @@ def test_another_file_of_the_same_version_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_another_kind_of_machine_adds_the_hashes_of_its_files_to_the_same_versions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wheel(tmp_path / "wheels", "1.0", 2.0)
     wheel(tmp_path / "wheels", "1.1", 3.0)
-    requirements = tmp_path / "gains.txt"
-    requirements.write_text(f"--no-index\n--find-links {tmp_path / 'wheels'}\ntiny\n")
     lock.write(requirements, requirements.read_text().splitlines()[:2], {"tiny==1.0": {"a" * 64}}, ["other"])
 
     assert build(requirements)

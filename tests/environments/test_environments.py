@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,16 @@ def environments(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@contextmanager
+def other_version(environments: Path) -> Iterator[None]:
+    """Another version of the package in the first environment, meanwhile."""
+    install(environments / "one", "1.5", 2.5)
+    try:
+        yield
+    finally:
+        install(environments / "one", "1.0", 2.0)
+
+
 @pytest.fixture(scope="module")
 def recorded(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "run.mcap"
@@ -90,11 +102,8 @@ def test_a_verification_repeats_each_operator_in_its_environment_and_names_other
     assert report.identical
     assert [v.packages_changed for v in report.operators] == [[], []]
 
-    install(environments / "one", "1.5", 2.5)
-    try:
+    with other_version(environments):
         report = verify(recorded)
-    finally:
-        install(environments / "one", "1.0", 2.0)
 
     assert report.culprits == ("first",)
     assert [v.packages_changed for v in report.operators] == [["tiny 1.0 -> 1.5"], []]
@@ -155,20 +164,6 @@ def test_an_operator_is_not_made_in_a_process_of_another_environment(recorded: P
         Debugger(recording, "first").goto(0)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("operator", ["first", "second"])
-def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, recorded: Path) -> None:
-    here = str(Path(__file__).resolve().parent)
-    words = ["debug", str(recorded), operator, "--do", "goto 1", "--path", here]
-    told = subprocess.run(
-        [sys.executable, "-m", "dataflow.cli.main", *words], capture_output=True, text=True, timeout=100
-    )
-
-    assert told.returncode == 0, told.stderr
-    assert f"{operator}  call 1 of " in told.stdout
-    assert "as recorded" in told.stdout
-
-
 def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     here = str(Path(__file__).resolve().parent)
     line = [sys.executable, "-m", "dataflow.cli.main", *words, "--path", here]
@@ -176,17 +171,24 @@ def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("operator", ["first", "second"])
+def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, recorded: Path, tmp_path: Path) -> None:
+    told = command("debug", str(recorded), operator, "--do", "goto 1", folder=tmp_path)
+
+    assert told.returncode == 0, told.stderr
+    assert f"{operator}  call 1 of " in told.stdout
+    assert "as recorded" in told.stdout
+
+
+@pytest.mark.long
 def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs_there(
     recorded: Path, environments: Path, tmp_path: Path
 ) -> None:
-    install(environments / "one", "1.5", 2.5)
-    try:
+    with other_version(environments):
         told = command("capture", str(recorded), "--op", "first", "--to", str(tmp_path / "test_it.py"), folder=tmp_path)
         assert told.returncode == 0, told.stderr
         with pytest.raises(AssertionError, match=r"in the environment .*one: (.|\n)*first: y.vectors: "):
             check(tmp_path / "test_it.capture")
-    finally:
-        install(environments / "one", "1.0", 2.0)
     check(tmp_path / "test_it.capture")
 
 
@@ -239,11 +241,8 @@ def test_a_fix_is_proven_by_calls_in_the_environment_of_its_operator(recorded: P
         return found
 
     assert prove(7.0)["reasons"][0] == "call 3 still gives what was recorded"
-    install(environments / "one", "1.5", 2.5)
-    try:
+    with other_version(environments):
         proof, wrong = prove(2.5), prove(7.0)
-    finally:
-        install(environments / "one", "1.0", 2.0)
 
     assert proof["proven"], proof["reasons"]
     assert proof["other_operators"] == {"identical": ["second"]}

@@ -18,7 +18,7 @@ class Tuned(held_runs.Odometry):
     dies: bool = Param(False, doc="ends the process instead")
 
     def setup(self) -> None:
-        import tiny  # type: ignore[import-not-found]
+        import tiny
 
         self.gain = tiny.GAIN
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from firing_operators import Looks, entry, node
 
-from dataflow.execution.absent import without_absent
+from dataflow.execution.live import without_absent
 from dataflow.graph.model import Live
 from dataflow.sync import Firing
 
@@ -13,11 +13,7 @@ INPUTS = {"x": ["t/s/x"], "constant": ["t/m/c"], "image": ["t/s/image"]}
 FIRING = Firing(
     100,
     "fire",
-    inputs={
-        "x": entry("t/s/x", 100, 0),
-        "constant": entry("t/m/c", 0, 0),
-        "image": entry("t/s/image", 90, 3),
-    },
+    inputs={"x": entry("t/s/x", 100, 0), "constant": entry("t/m/c", 0, 0), "image": entry("t/s/image", 90, 3)},
 )
 
 
@@ -26,7 +22,7 @@ def test_a_firing_of_present_producers_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize("policy", ["keep", "drop"])
-def test_what_an_absent_producer_left_is_stale_and_dropped_where_the_policy_says_so(policy: str) -> None:
+def test_samples_of_absent_producer_are_stale_and_dropped_by_policy(policy: str) -> None:
     made = node(Looks, INPUTS, Live("newest", 16, {}, on_stale=policy))
 
     changed = without_absent(FIRING, made, {"t/s/image"})

@@ -170,7 +170,7 @@ def test_a_message_that_is_kept_has_its_stamp_at_the_next_firing_and_in_snapshot
     played = play(operator, {"number": [Number(stamp=3, value=1), Number(stamp=8, value=1)]})
     assert [n.value for n in played["pace"]] == [0, 5]
     later = Keeping()
-    later.restore(operator.snapshot())  # type: ignore[arg-type]
+    later.restore(operator.snapshot())
     assert later.state.last == Number(stamp=8, value=1)
 
 
@@ -214,7 +214,7 @@ def test_what_no_firing_makes_gives_its_stamp_and_frame(operator: Operator, mess
         play(operator, None if isinstance(operator, Source) else {"number": [Number(stamp=1, value=0)]})
 
 
-def test_a_call_without_a_runner_leaves_them_out_and_says_so() -> None:
+def test_call_without_runner_leaves_stamp_and_frame_unset() -> None:
     made = Unframed().process(Number(stamp=1, value=0))
     assert made.position.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match=r"Point has no frame: .* when process\(\) returns the message"):

@@ -73,7 +73,7 @@ def test_a_step_of_the_feeds_is_worked_through_before_the_next_is_given() -> Non
     class Noting(HandOver):
         def message(self, stream: str, entry: object) -> None:
             given.append(sum(runner.firings for runner in driver.operators))
-            super().message(stream, entry)  # type: ignore[arg-type]
+            super().message(stream, entry)
 
     driver = Driver()
     chain(driver, "a", "b")

@@ -95,14 +95,7 @@ def again(ran: Collector, body: Body | None = None, **options: Any) -> RecordedR
     asking = node(Asking, {"x": [STREAM]})
     repetition = Repetition(lambda: ran.records, stateless=asking.operator.stateless)
     look_at([repetition])
-    runner = RecordedRunner(
-        asking,
-        Collector(),
-        static=frozenset(),
-        repetition=repetition,
-        inputs=inputs,
-        **options,
-    )
+    runner = RecordedRunner(asking, Collector(), static=frozenset(), repetition=repetition, inputs=inputs, **options)
     runner.setup()
     for message in MESSAGES:
         runner.push(STREAM, message)
@@ -404,7 +397,7 @@ class Textless(LookupError):
     """An error whose text cannot be made."""
 
     def __str__(self) -> str:
-        return str(self.absent)  # type: ignore[attr-defined]
+        return str(self.absent)
 
 
 def _local() -> Exception:
@@ -416,8 +409,8 @@ def _local() -> Exception:
 
 def _cyclic() -> Exception:
     error = ValueError("loop")
-    error.origin = error  # type: ignore[attr-defined]
-    error.all = loop = []  # type: ignore[attr-defined, var-annotated]
+    error.origin = error
+    error.all = loop = []
     loop.append(loop)
     return error
 
@@ -646,7 +639,7 @@ def test_a_firing_without_effects_leaves_its_record_as_it_is() -> None:
     ran = recorded(lambda operator, x: 1.0)
 
     assert all(not record.detail for record in ran.records if record.kind == "fire")
-    assert "EffectMiss" in again(ran, lambda operator, x: operator.effect(ask)).result.first.got  # type: ignore[union-attr]
+    assert "EffectMiss" in again(ran, lambda operator, x: operator.effect(ask)).result.first.got
 
 
 def test_a_miss_is_no_exception_that_operators_expect() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from firing_operators import Collector, Either, entry, node, run_all
 
-from dataflow.execution.event_time import EventTime
+from dataflow.execution.admission import EventTime
 from dataflow.execution.live import LiveRunner
 from dataflow.graph.model import Live
 

@@ -124,7 +124,7 @@ def feed(played: Played, **options: Any) -> tuple[LogFeed, Told]:
     told = Told()
     nodes = {"t/m/map": "m", "t/s/x": "s", "t/s/y": "s"}
     ports = {"m": ("t/m/map",), "s": ("t/s/x", "t/s/y")}
-    return LogFeed(played, nodes, told, ports=ports, **{"finals": {}, **options}), told  # type: ignore[arg-type]
+    return LogFeed(played, nodes, told, ports=ports, **{"finals": {}, **options}), told
 
 
 def given_whole(log: LogFeed) -> None:

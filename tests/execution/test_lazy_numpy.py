@@ -68,7 +68,7 @@ def _kept() -> float:
 
 
 def _raw() -> Any:
-    return mtrand._rand._bit_generator.random_raw(3)  # type: ignore[attr-defined]
+    return mtrand._rand._bit_generator.random_raw(3)
 
 
 USES: dict[str, Callable[[], Any]] = {name: _method(name) for name in METHODS} | {
@@ -78,8 +78,8 @@ USES: dict[str, Callable[[], Any]] = {name: _method(name) for name in METHODS} |
     "a state of its own": lambda: (np.random.set_state(SOME_STATE), np.random.normal()),
     "state kept and put back": _kept,
     "raw numbers": _raw,
-    "a Generator on it": lambda: np.random.Generator(mtrand._rand._bit_generator).random(),  # type: ignore[attr-defined]
-    "pickled": lambda: pickle.loads(pickle.dumps(mtrand._rand)).random_sample(),  # type: ignore[attr-defined]
+    "a Generator on it": lambda: np.random.Generator(mtrand._rand._bit_generator).random(),
+    "pickled": lambda: pickle.loads(pickle.dumps(mtrand._rand)).random_sample(),
 }
 
 
@@ -154,5 +154,5 @@ def test_looking_at_the_generator_tells_of_as_many_draws_as_bring_it_back_to_its
 
     np.random.bytes(4 * 624)
 
-    assert np.random.get_state(legacy=False)["state"]["pos"] == state["state"]["pos"]  # type: ignore[call-overload]
+    assert np.random.get_state(legacy=False)["state"]["pos"] == state["state"]["pos"]
     assert peek() != before

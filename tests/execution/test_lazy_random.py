@@ -44,7 +44,7 @@ USES: dict[str, Callable[[], Any]] = {
     "a state of its own": lambda: (random.setstate(SOME_STATE), random.random()),
     "a state of its own, bound before": lambda: (set_state(SOME_STATE), gauss(0, 1)),
     "state kept and put back": lambda: (s := random.getstate(), random.seed(1), random.setstate(s), random.random())[3],
-    "the generator itself": lambda: random._inst.random(),  # type: ignore[attr-defined]
+    "the generator itself": lambda: random._inst.random(),
     "a name that was taken while it was pending": lambda: _taken(),
 }
 
@@ -81,7 +81,7 @@ def test_what_is_drawn_is_the_same(use: str) -> None:
 
         seed_lazily(seed + 1)
         seed_lazily(seed)
-        assert random._inst.__class__ is lazy_random._Pending  # type: ignore[attr-defined]
+        assert random._inst.__class__ is lazy_random._Pending
         assert (USES[use](), [random.random() for _ in range(700)]) == expected
 
 
@@ -94,7 +94,7 @@ def test_a_draw_after_a_draw_is_seeded_anew() -> None:
     assert drawn[0] == drawn[1]
 
 
-def test_the_generator_is_seeded_at_once_where_somebody_has_its_c_functions() -> None:
+def test_generator_is_seeded_at_once_where_another_module_holds_its_c_functions() -> None:
     random.random()  # whatever was pending is no more
     held = random.random
     random.seed(3)
@@ -112,7 +112,7 @@ def test_looking_at_the_generator_does_not_draw() -> None:
     before = peek()
 
     assert peek() == before
-    assert random._inst.__class__ is lazy_random._Pending  # type: ignore[attr-defined]
+    assert random._inst.__class__ is lazy_random._Pending
     random.random()
     assert peek() != before
     before = peek()

@@ -9,8 +9,8 @@ from firing_operators import Collector, Echo, Either, Gathers, Looks, Loop, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dataflow.execution.driver import Ready
 from dataflow.execution.live import LiveRunner
-from dataflow.execution.ready import Ready
 from dataflow.graph.model import Live
 from dataflow.sync import FOREVER
 

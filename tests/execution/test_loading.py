@@ -94,7 +94,7 @@ def made(todo: Callable[[], float], *, calls: int = 1, version: int = 3) -> list
 def open3d_seed() -> float:
     import open3d
 
-    return float(open3d.utility.random.seeds[-1])  # type: ignore[attr-defined]
+    return float(open3d.utility.random.seeds[-1])
 
 
 def test_a_library_is_seeded_in_the_call_that_loads_it(modules: Path) -> None:
@@ -107,7 +107,7 @@ def test_runs_of_a_scheme_before_are_not_seeded_while_they_load(modules: Path) -
     def seeds() -> float:
         import open3d
 
-        return len(open3d.utility.random.seeds)  # type: ignore[attr-defined]
+        return len(open3d.utility.random.seeds)
 
     assert made(seeds, version=2, calls=2) == [0, 1]
 
@@ -141,7 +141,7 @@ def test_what_a_module_draws_or_seeds_while_it_is_loaded_is_taken_back(modules: 
     def draws() -> float:
         for _ in range(before):
             random.random(), np.random.random()
-        import drawing  # type: ignore[import-not-found]  # noqa: F401
+        import drawing  # noqa: F401
 
         return random.random() + float(np.random.random())
 

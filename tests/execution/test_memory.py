@@ -35,7 +35,7 @@ def test_a_message_that_several_were_given_is_the_input_of_the_writer(
 
 
 @pytest.mark.parametrize("order", ["reader first", "writer first"])
-def test_one_that_is_given_a_message_before_or_after_another_writes_into_it_is_reached(order: str) -> None:
+def test_readers_of_an_overwritten_message_are_reached(order: str) -> None:
     guard, before, given = MemoryGuard(keeping=True), entry("x", 6, 0), entry("x", 7, 1)
     guard.take("bystander", Firing(6, "fire", inputs={"x": before}))
     if order == "reader first":

@@ -7,7 +7,7 @@ from itertools import groupby
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.execution.feeds.numbering import gapless
+from dataflow.execution.feeds.log import gapless
 from dataflow.messages import Number
 from dataflow.recording import Recorded
 

@@ -33,7 +33,7 @@ def test_a_stamp_far_ahead_is_refused_in_words() -> None:
 
 @pytest.mark.parametrize("queue", ["newest", "block"])
 def test_a_live_run_leaves_ticks_out_and_counts_them(queue: str) -> None:
-    made = node(Timer, {"x": ["t/s/x"]}, Live(queue, 4, {"x": 0}))  # type: ignore[arg-type]
+    made = node(Timer, {"x": ["t/s/x"]}, Live(queue, 4, {"x": 0}))
     collector = Collector()
     runner = LiveRunner(made, collector, static=frozenset(), event_clock=lambda: BOOT)
     runner.setup()

@@ -67,7 +67,7 @@ def test_it_holds_or_plays_and_steps_are_only_made_while_paused(actions: list[st
     playback = Playback()
     for action in actions:
         if action != "passed":
-            playback.do(action)  # type: ignore[arg-type]
+            playback.do(action)
         elif not playback.holds:
             playback.passed()
         assert not (playback.stepping and not playback.paused)
@@ -76,7 +76,7 @@ def test_it_holds_or_plays_and_steps_are_only_made_while_paused(actions: list[st
 
 def test_an_unknown_action_is_refused() -> None:
     with pytest.raises(ValueError, match="expected one of"):
-        Playback().do("rewind")  # type: ignore[arg-type]
+        Playback().do("rewind")
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
     with os.fdopen(slave, "r") as terminal:
         monkeypatch.setattr("sys.stdin", terminal)
         before = termios.tcgetattr(terminal)
-        with _steered(offers, Steered()):  # type: ignore[arg-type]
+        with _steered(offers, Steered()):
             os.write(master, b" nk\x1b[Cq")
             assert came.wait(10)
         after = termios.tcgetattr(terminal)

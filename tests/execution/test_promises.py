@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.execution.feeds.promises import promises
+from dataflow.execution.feeds.log import promises
 from dataflow.sync import FOREVER, NEVER
 
 INCARNATIONS = st.lists(st.lists(st.integers(0, 50), unique=True, min_size=1).map(sorted), max_size=5)

@@ -8,8 +8,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.execution.driver import Ready
 from dataflow.execution.protocol import Runner
-from dataflow.execution.ready import Ready
 
 
 class Scripted(Runner):
@@ -75,7 +75,7 @@ class Listed:
             if self.until[number] is None:
                 self.noted.pop(number, None)
             else:
-                self.noted[number] = when  # type: ignore[assignment]
+                self.noted[number] = when
         return worked
 
     def next_due(self, now: float) -> float | None:
@@ -93,7 +93,7 @@ ACTIONS = st.one_of(
 
 
 @given(st.lists(ACTIONS, max_size=40))
-def test_the_same_are_asked_in_the_same_order_as_by_a_look_at_everybody(actions: list[tuple[str, int, Any]]) -> None:
+def test_runners_are_asked_in_the_same_order_as_by_brute_force(actions: list[tuple[str, int, Any]]) -> None:
     clock, listed = Clock(), Listed()
     log: list[int] = []
     ready = Ready(clock)

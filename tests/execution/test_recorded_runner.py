@@ -83,7 +83,7 @@ def test_an_operator_that_draws_wherever_it_is_called_is_identical() -> None:
     assert {"reset", "param", "snapshot", "finish"} <= set(ran.kinds())
     assert runner.result.first is None
     assert runner.result.verdict == "identical"
-    assert runner.emitter.numbers == ran.numbers  # type: ignore[attr-defined]
+    assert runner.emitter.numbers == ran.numbers
 
 
 def test_a_recording_of_the_first_seeding_is_identical_by_that_and_not_by_another() -> None:
@@ -126,12 +126,7 @@ def restarted_run(made: Node, messages: Iterable[Entry], changes: int) -> Collec
     errors = iter([None, Fails("once"), None])
     faults: Any = SimpleNamespace(before=lambda firing: next(errors, None))
     runner = LiveRunner(
-        made,
-        collector,
-        static=frozenset(),
-        event_clock=lambda: 10**6,
-        faults=faults,
-        snapshots=StateSpacing(1),
+        made, collector, static=frozenset(), event_clock=lambda: 10**6, faults=faults, snapshots=StateSpacing(1)
     )
     runner.setup()
     for number, message in enumerate(messages):
@@ -199,10 +194,10 @@ def test_generators_are_as_they_were_for_setup_and_firings() -> None:
         made = dice()
         calls = Calls(made, made.make(), 7, version=version)
         calls.setup()
-        assert (calls.operator.total, random.random()) == (0.33391226253429185, 0.3500716924112217)  # type: ignore[attr-defined]
-        calls.operator.total = 0.0  # type: ignore[attr-defined]
+        assert (calls.operator.total, random.random()) == (0.33391226253429185, 0.3500716924112217)
+        calls.operator.total = 0.0
         calls.process(Firing(100, "fire", inputs={"x": MESSAGES[0]}))
-        assert (calls.operator.total, random.random()) == (0.32187845154943107, 0.9575942977611154)  # type: ignore[attr-defined]
+        assert (calls.operator.total, random.random()) == (0.32187845154943107, 0.9575942977611154)
 
 
 def test_a_difference_after_an_input_without_a_recorded_digest_is_not_the_operators_own() -> None:

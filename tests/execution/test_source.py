@@ -33,7 +33,7 @@ class InOrder(Collector):
         self.order: list[str] = []
 
     def message(self, stream: str, entry: object) -> None:
-        super().message(stream, entry)  # type: ignore[arg-type]
+        super().message(stream, entry)
         self.order.append(f"message of {stream}")
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:

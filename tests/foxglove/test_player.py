@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_recordings import recorded
 
 from dataflow.foxglove.player import Clock, play
-from dataflow.messages import Number, Transforms
-from dataflow.recording import Recorded, Recording, RecordingWriter
+from dataflow.messages import Message, Number, Transforms
+from dataflow.recording import Recorded, Recording
 
 SECOND = 10**9
 
@@ -28,18 +29,13 @@ class Wall:
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Iterator[Recording]:
-    path = tmp_path / "r.mcap"
-    with RecordingWriter(path, metadata={}, namespace="r") as writer:
-        writer.add_stream("r/mount/frames", Transforms, static=True)
-        frames = Transforms(
-            stamp=0, frames=("base",), child_frames=("camera",), translations=np.zeros((1, 3)),
-            rotations=np.array([[0.0, 0.0, 0.0, 1.0]]),
-        )  # fmt: skip
-        writer.write("r/mount/frames", frames, seq=0)
-        for stream, step in (("r/fast/y", 1), ("r/slow/y", 4)):
-            writer.add_stream(stream, Number)
-            for seq in range(0, 10, step):
-                writer.write(stream, Number(stamp=(10 + seq) * SECOND, value=float(seq)), seq=seq)
+    rows: list[tuple[str, Message]] = [
+        (stream, Number(stamp=(10 + k) * SECOND, value=float(k)))
+        for stream, step in (("r/fast/y", 1), ("r/slow/y", 4))
+        for k in range(0, 10, step)
+    ]
+    rows.append(("r/mount/frames", Transforms.from_matrix(np.eye(4), stamp=0, frame="base", child_frame="camera")))
+    path = recorded(tmp_path / "r.mcap", rows, static=["r/mount/frames"], namespace="r")
     with Recording(path) as opened:
         yield opened
 
@@ -125,7 +121,7 @@ def test_time_stands_while_paused_and_passes_by_the_speed() -> None:
     assert clock.state()[1] == 0
 
 
-def test_who_waits_for_a_stamp_is_woken_by_a_jump_and_by_the_end() -> None:
+def test_waiting_for_a_stamp_ends_at_a_seek_and_at_the_end() -> None:
     for wake in (lambda clock: clock.request(playing=True, speed=1, seek=0), Clock.close):
         clock = Clock(0, 10**15)
         timer = threading.Timer(0.01, wake, [clock])

@@ -158,9 +158,9 @@ def test_the_playback_bar_moves_the_clock() -> None:
     assert (status, current, speed, did_seek) == (1, STAMP + 5 * 10**9, 2.0, 1)
 
 
-def test_a_jump_that_is_refused_moves_nothing_and_is_said() -> None:
+def test_a_refused_seek_moves_nothing_and_is_reported() -> None:
     class Fixed(Clock):
-        def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:  # type: ignore[override]
+        def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:
             return "no jumps here" if seek is not None else None
 
     clock = Fixed(STAMP, STAMP + 10**10)
@@ -214,7 +214,7 @@ def test_a_bag_is_played_as_a_recording_is(tmp_path: Path) -> None:
     assert said["text"] == "hello"
 
 
-def test_a_port_that_is_taken_is_an_error_that_says_so(server: FoxgloveServer) -> None:
+def test_a_port_in_use_is_named(server: FoxgloveServer) -> None:
     port = int(server.address.rpartition(":")[2])
     with pytest.raises(FoxgloveError, match=f"cannot listen on 127.0.0.1:{port}"):
         FoxgloveServer("second", port=port)

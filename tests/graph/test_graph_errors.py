@@ -22,7 +22,7 @@ operators:
 
 def problems(text: str, **options: object) -> tuple[Problem, ...]:
     with pytest.raises(GraphError) as caught:
-        load_text(text, **options)  # type: ignore[arg-type]
+        load_text(text, **options)
     return caught.value.problems
 
 

@@ -106,7 +106,7 @@ def test_a_file_resolves_to_streams_parameters_and_policies(tmp_path: Path) -> N
         ("cloud", "image"),
         ("detector", "image"),
     ]
-    assert graph.nodes["cloud"].make().stride == 4  # type: ignore[attr-defined]
+    assert graph.nodes["cloud"].make().stride == 4
 
 
 def test_processes_follow_process_labels_unless_overridden() -> None:
@@ -256,6 +256,20 @@ def test_faults_between_nested_graphs(change: tuple[str, str], said: str) -> Non
     with pytest.raises(GraphError) as caught:
         load_text(OUTER.replace(*change), file="outer.yaml", files={"parts/front.yaml": FRONT})
     assert said in str(caught.value)
+
+
+def test_consumers_of_an_output_whose_operator_cannot_be_loaded_are_no_faults() -> None:
+    inner = "graph: i\noperators:\n  a: {use: 'absent_module:A'}\noutputs: {seen: a/seen}\n"
+    middle = "graph: m\noperators:\n  i: {use: inner.yaml}\noutputs: {seen: i/seen}\n"
+    outer = """\
+graph: o
+operators:
+  m: {use: middle.yaml}
+  b: {use: "graph_operators:Odometry", inputs: {image: m/seen}}
+"""
+    with pytest.raises(GraphError) as caught:
+        load_text(outer, file="outer.yaml", files={"middle.yaml": middle, "inner.yaml": inner})
+    assert [p.file for p in caught.value.problems] == ["inner.yaml"]
 
 
 def test_graphs_that_nest_each_other_are_refused() -> None:

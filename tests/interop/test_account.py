@@ -2,48 +2,44 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from exporting import exported
 from made_bags import ROS2, SECOND, header, imus, ros, transform, write_ros2, xyz
+from made_recordings import recorded
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import get_types_from_msg
 
 from dataflow.interop.bag import BagError
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
 from dataflow.interop.export.ros2 import export_ros2
+from dataflow.interop.export.source import ExportSource
 from dataflow.interop.opening import open_bag
 from dataflow.interop.playing import Wishes, readable
 from dataflow.interop.seen import Seen
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.messages import Image, Image16, Measurement, Number, PointCloud, RangeReading
-from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording import Recording
 from dataflow.recording.layout import BAG
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(6)]
 
 
 def image(stamp: int, encoding: str, data: bytes, width: int, height: int, step: int) -> Any:
-    return ros(
-        "sensor_msgs/Image",
-        header=header(stamp, "camera"),
-        width=width,
-        height=height,
-        encoding=encoding,
-        step=step,
-        data=np.frombuffer(data, np.uint8),
-    )
+    about = {"width": width, "height": height, "encoding": encoding, "step": step}
+    return ros("sensor_msgs/Image", header=header(stamp, "camera"), data=np.frombuffer(data, np.uint8), **about)
 
 
-def converted(bag: Path, file: Path, **options: Any) -> Material:
-    with Material(bag, **options) as material:
-        export_own(material, file, Exported())
-        return material
+def converted(bag: Path, file: Path, **options: Any) -> ExportSource:
+    with ExportSource(bag, **options) as source:
+        export_own(source, file, Exported())
+        return source
 
 
 def read(file: Path, stream: str) -> list[Any]:
@@ -59,10 +55,10 @@ def test_one_message_that_cannot_be_read_is_passed_over_and_counted(tmp_path: Pa
     ]
     bag = write_ros2(tmp_path / "bag", rows)
 
-    material = converted(bag, tmp_path / "o.mcap")
+    source = converted(bag, tmp_path / "o.mcap")
 
     assert [m.stamp for m in read(tmp_path / "o.mcap", "img")] == [s for i, s in enumerate(STAMPS) if i != bad]
-    assert material.account.unread["/img"].count == 1
+    assert source.account.unread["/img"].count == 1
     with Recording(tmp_path / "o.mcap") as recording:
         assert [m.seq for m in recording.messages(["img"])] == [0, 1, 2, 3, 4]
         assert '"messages": 1' in recording.metadata[BAG]["unread"]
@@ -112,14 +108,10 @@ def test_bytes_behind_the_last_row_of_an_image_are_named(tmp_path: Path) -> None
 
 
 def test_transforms_of_a_frame_to_itself_and_further_parents_are_named(tmp_path: Path) -> None:
-    rows = [
-        (
-            "/tf",
-            s,
-            ros("tf2_msgs/TFMessage", transforms=[transform(s, parent, "base") for parent in ("a", "b", "base")]),
-        )
-        for s in STAMPS
-    ]
+    rows = []
+    for s in STAMPS:
+        placed = [transform(s, parent, "base") for parent in ("a", "b", "base")]
+        rows.append(("/tf", s, ros("tf2_msgs/TFMessage", transforms=placed)))
 
     account = converted(write_ros2(tmp_path / "bag", rows), tmp_path / "o.mcap").account
 
@@ -192,8 +184,7 @@ def test_16_bits_ranges_and_measurements_keep_what_they_hold_there_and_back(tmp_
     bag = write_ros2(tmp_path / "bag", rows)
 
     account = converted(bag, tmp_path / "o.mcap").account
-    with Material(tmp_path / "o.mcap") as material:
-        export_ros2(material, tmp_path / "back", Exported())
+    exported(tmp_path / "o.mcap", export_ros2, tmp_path / "back")
     again = converted(tmp_path / "back", tmp_path / "again.mcap").account
 
     assert not account.lost
@@ -242,7 +233,7 @@ def test_depth_in_metres_has_no_units(tmp_path: Path) -> None:
     assert "not of 16-bit units" in account.unread["/d"].reason
 
 
-def test_static_transforms_that_change_are_told(tmp_path: Path) -> None:
+def test_changing_static_transforms_are_noted(tmp_path: Path) -> None:
     rows = [("/tf_static", STAMPS[i], ros("tf2_msgs/TFMessage", transforms=[transform(0, "base", "laser", x)]))
             for i, x in ((0, 0.1), (2, 0.1), (4, 9.9))]  # fmt: skip
     bag = write_ros2(tmp_path / "bag", [*rows, *imus(STAMPS)])
@@ -256,21 +247,15 @@ def test_topics_keep_their_names_and_numbers_their_units_both_ways(tmp_path: Pat
     rows = [(f"/vicon/{c}", s, transform(s, "world", c)) for s in STAMPS for c in "ab"]
     bag = write_ros2(tmp_path / "bag", rows)
     converted(bag, tmp_path / "o.mcap")
-    with RecordingWriter(tmp_path / "n.mcap", metadata={}) as writer:
-        writer.add_stream("speed", Number)
-        writer.write("speed", Number(stamp=STAMPS[0], value=3.0, unit="m/s"), seq=0)
+    recorded(tmp_path / "n.mcap", [("speed", Number(stamp=STAMPS[0], value=3.0, unit="m/s"))])
 
     for name in ("o", "n"):
-        with Material(tmp_path / f"{name}.mcap") as material:
-            export_ros2(material, tmp_path / name, Exported())
+        exported(tmp_path / f"{name}.mcap", export_ros2, tmp_path / name)
     converted(tmp_path / "n", tmp_path / "again.mcap")
 
-    back = open_bag(tmp_path / "o")
-    assert {t.name: t.schema.name for t in back.topics.values()} == {
-        "/vicon/a": "geometry_msgs/msg/TransformStamped",
-        "/vicon/b": "geometry_msgs/msg/TransformStamped",
-    }
-    back.close()
+    with closing(open_bag(tmp_path / "o")) as back:
+        held = {topic.name: topic.schema.name for topic in back.topics.values()}
+    assert held == dict.fromkeys(("/vicon/a", "/vicon/b"), "geometry_msgs/msg/TransformStamped")
     assert read(tmp_path / "again.mcap", "speed")[0].unit == "m/s"
 
 
@@ -291,11 +276,9 @@ def test_all_of_a_bag_in_simulated_time_is_on_one_clock(tmp_path: Path) -> None:
 
 def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -> None:
     bag = write_ros2(tmp_path / "bag", imus(STAMPS))
-    opened = open_bag(bag)
 
-    with pytest.raises(BagError, match="read as Imu, which cannot be depth"):
+    with closing(open_bag(bag)) as opened, pytest.raises(BagError, match="read as Imu, which cannot be depth"):
         readable(opened, bag, wishes=Wishes(depth={"/imu": 1000}))
-    opened.close()
 
 
 def test_a_topic_of_two_types_keeps_both_there_and_back(tmp_path: Path) -> None:
@@ -307,13 +290,10 @@ def test_a_topic_of_two_types_keeps_both_there_and_back(tmp_path: Path) -> None:
                 writer.write(connection, stamp, ROS2.serialize_cdr(ROS2.types[name](data=value), name))
 
     converted(tmp_path / "bag", tmp_path / "o.mcap")
-    for source in ("bag", "o.mcap"):
-        with Material(tmp_path / source) as material:
-            export_ros2(material, tmp_path / f"of_{source}", Exported())
-
-        back = open_bag(tmp_path / f"of_{source}")
-        held = {(topic.name, topic.schema.name): topic.count for topic in back.topics.values()}
-        back.close()
+    for name in ("bag", "o.mcap"):
+        exported(tmp_path / name, export_ros2, tmp_path / f"of_{name}")
+        with closing(open_bag(tmp_path / f"of_{name}")) as back:
+            held = {(topic.name, topic.schema.name): topic.count for topic in back.topics.values()}
         assert held == {("/x", "std_msgs/msg/String"): 4, ("/x (std_msgs/msg/Float64)", "std_msgs/msg/Float64"): 2}
 
 

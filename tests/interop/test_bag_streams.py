@@ -203,7 +203,7 @@ def test_equal_messages_of_a_log_without_times_are_not_taken_for_one(tmp_path: P
     assert opened.account.repaired == {"/said": {"moved": 6 - len(set(log))}}
 
 
-def test_a_log_without_times_is_said_by_every_command_that_opens_it(tmp_path: Path) -> None:
+def test_a_log_without_times_is_noted(tmp_path: Path) -> None:
     texts = [("/said", 0, ros("std_msgs/String", data="on"))] * 2
 
     assert "all messages have the log time 0" in open_bag(write_ros2(tmp_path / "bag", texts)).notes[0]

@@ -75,7 +75,7 @@ def test_headers_that_stand_still_are_not_taken() -> None:
     assert choose_clock([times([LOG[0]] * 10, shares=True)]).kind == "header"
 
 
-def test_latched_topic_has_no_say_and_counts_from_when_it_was_heard() -> None:
+def test_latched_topics_do_not_choose_the_clock_and_are_stamped_on_arrival() -> None:
     old = times(LOG[:1] - 3600 * S, "/tf_static", LOG[:1], latched=True)
     clock = choose_clock([times(LOG), old])
 

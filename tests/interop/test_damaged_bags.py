@@ -6,14 +6,15 @@ import re
 import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 import zstandard
 from made_bags import ROS1, SECOND, imus, write_ros2
+from made_recordings import foreign
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 
 from dataflow.interop.bag import BagError, shortfalls
@@ -25,25 +26,15 @@ STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(300)]
 
 def held(path: Path, *, strict: bool = False) -> tuple[list[bytes], list[str]]:
     """Messages of all topics in their order, and what is said to be missing."""
-    bag = open_bag(path, strict=strict)
-    try:
-        found = [bytes(stored.data) for stored in bag.messages(list(bag.topics))]
-        return found, shortfalls(bag)
-    finally:
-        bag.close()
+    with closing(open_bag(path, strict=strict)) as bag:
+        return [bytes(stored.data) for stored in bag.messages(list(bag.topics))], shortfalls(bag)
 
 
 def mcap_of(path: Path, compression: CompressionType = CompressionType.ZSTD) -> Path:
     """300 messages in some 10 chunks."""
-    with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=4096, compression=compression)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        channel = writer.register_channel("/any", "json", schema)
-        for i, stamp in enumerate(STAMPS):
-            writer.add_message(channel, stamp, b'{"number": %d, "text": "%s"}' % (i, b"abcdefgh" * 10), stamp, i)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return path
+    messages = [(stamp, b'{"number": %d, "text": "%s"}' % (i, b"abcdefgh" * 10)) for i, stamp in enumerate(STAMPS)]
+    any_ = ("/any", "json", ("any", "jsonschema", b"{}"), messages)
+    return foreign(path, any_, chunk_size=4096, compression=compression)
 
 
 def chunk_of(path: Path, number: int) -> tuple[int, int, int]:
@@ -266,9 +257,8 @@ def test_a_download_whose_second_half_is_zeros_is_read_and_fails_the_command(tmp
     whole, _ = held(file)
     file.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
 
-    bag = open_bag(file)
-    found = [bytes(stored.data) for stored in bag.messages(list(bag.topics))]
-    bag.close()
+    with closing(open_bag(file)) as bag:
+        found = [bytes(stored.data) for stored in bag.messages(list(bag.topics))]
 
     assert len(whole) // 4 < len(found) < len(whole)
     assert sum(data not in whole for data in found) <= 1  # the one in which the zeros begin: it has no checksum

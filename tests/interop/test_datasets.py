@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from exporting import exported
+from made_recordings import of_robot
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
@@ -17,8 +19,8 @@ from dataflow.interop.export.datasets import DATASETS, export_7scenes, export_ki
 from dataflow.interop.export.kitti_raw import export_kitti_raw
 from dataflow.interop.export.lerobot import export_lerobot
 from dataflow.interop.export.lerobot_layouts import Layout30
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import (
     CameraInfo,
     DepthImage,
@@ -32,121 +34,94 @@ from dataflow.messages import (
     Transforms,
     Twist,
 )
-from dataflow.recording import RecordingError, RecordingWriter
+from dataflow.recording import RecordingError
 from operators.sources.kitti_raw import KittiRaw
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 
 
-def write(path: Path, streams: dict[str, list[Message]], static: tuple[str, ...] = ()) -> Path:
-    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
-        for name, messages in streams.items():
-            writer.add_stream(f"robot1/{name}", type(messages[0]), static=name in static)
-            for seq, message in enumerate(messages):
-                writer.write(f"robot1/{name}", message, seq=seq)
-    return path
-
-
 def arm(frames: int = 6) -> dict[str, list[Message]]:
     """A camera at 10 Hz, joints at 50 Hz and commands that begin after the first image."""
     rng = np.random.default_rng(0)
     joints = [
-        JointState(stamp=START + k * SECOND // 50, names=("a", "b"), positions=np.array([k, -k], float))
-        for k in range(frames * 5)
+        JointState(stamp=START + k * SECOND // 50, names=("a", "b"), positions=[k, -k]) for k in range(frames * 5)
     ]
+    stamps = [START + k * SECOND // 10 for k in range(frames)]
     commands = [
-        Twist(
-            stamp=START + SECOND // 20 + k * SECOND // 10, frame="b", linear=np.array([k, 0, 0.0]), angular=np.zeros(3)
-        )
-        for k in range(frames)
+        Twist(stamp=stamp + SECOND // 20, frame="b", linear=[k, 0, 0], angular=[0, 0, 0])
+        for k, stamp in enumerate(stamps)
     ]
-    images = [
-        Image(stamp=START + k * SECOND // 10, frame="c", data=rng.integers(0, 256, (12, 16, 3), np.uint8))
-        for k in range(frames)
-    ]
+    images = [Image(stamp=s, frame="c", data=rng.integers(0, 256, (12, 16, 3), np.uint8)) for s in stamps]
     return {"camera/image": images, "arm/joints": joints, "cmd/twist": commands, "said": [Text(stamp=START, text="go")]}
 
 
 def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: Path) -> None:
-    material_of = arm()
-    path, done = write(tmp_path / "a.mcap", material_of), Exported()
+    streams_of = arm()
 
-    with Material(path) as material:
-        export_lerobot(material, tmp_path / "set", done, action="cmd/twist", task="pick it up")
+    path = of_robot(tmp_path / "a.mcap", streams_of)
+    done = exported(path, export_lerobot, tmp_path / "set", action="cmd/twist", task="pick it up")
 
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     table = pq.read_table(tmp_path / "set" / info["data_path"].format(episode_chunk=0, episode_index=0))
     rows = table.to_pylist()
     assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v2.1", 10, 5)
-    assert [row["stamp"] for row in rows] == [m.stamp for m in material_of["camera/image"][1:]]
+    assert [row["stamp"] for row in rows] == [m.stamp for m in streams_of["camera/image"][1:]]
     assert [row["observation.state"] for row in rows] == [[5.0 * k, -5.0 * k] for k in range(1, 6)]
     assert [row["action"][0] for row in rows] == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert np.allclose([row["timestamp"] for row in rows], np.arange(5) / 10)
     picture = rows[0]["observation.images.camera.image"]["bytes"]
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
-    assert np.array_equal(decoded, material_of["camera/image"][1].data)  # type: ignore[attr-defined]
+    assert np.array_equal(decoded, streams_of["camera/image"][1].data)
     assert set(info["features"]) == set(table.column_names)
     assert info["features"]["observation.images.camera.image"]["shape"] == [12, 16, 3]
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
 
 
 def test_what_no_frame_of_a_lerobot_dataset_takes_is_counted_as_lost_and_not_as_written(tmp_path: Path) -> None:
-    material_of = arm()
+    streams_of = arm()
     for k in (4, 5):  # a pause of an hour in front of them
-        moved = material_of["camera/image"][k]
-        material_of["camera/image"][k] = moved.replace(stamp=moved.stamp + 3600 * SECOND)
-    done = Exported()
-    with Material(write(tmp_path / "a.mcap", material_of)) as material:
-        export_lerobot(material, tmp_path / "set", done)
+        moved = streams_of["camera/image"][k]
+        streams_of["camera/image"][k] = moved.replace(stamp=moved.stamp + 3600 * SECOND)
+    done = exported(of_robot(tmp_path / "a.mcap", streams_of), export_lerobot, tmp_path / "set")
 
     lost = {name: sum(losses.values()) for name, losses in done.lost.items()}
     frames = done.written["camera/image"]
     assert frames == 5  # the first image came before the first command
     assert done.written["arm/joints"] == 4
-    assert done.written["arm/joints"] + lost["arm/joints"] == len(material_of["arm/joints"])
-    assert done.written["cmd/twist"] + lost["cmd/twist"] == len(material_of["cmd/twist"])
+    assert done.written["arm/joints"] + lost["arm/joints"] == len(streams_of["arm/joints"])
+    assert done.written["cmd/twist"] + lost["cmd/twist"] == len(streams_of["cmd/twist"])
     assert [number for what, number in done.lost["camera/image"].items() if "pauses" in what] == [1]
 
 
 def test_two_cameras_of_one_name_in_lerobot_are_refused_by_their_names(tmp_path: Path) -> None:
     streams = arm()
-    path = write(
-        tmp_path / "a.mcap", {"camera/image": streams["camera/image"], "camera.image": streams["camera/image"]}
-    )
-    with Material(path) as material, pytest.raises(RecordingError, match=r"camera\.image and camera/image are both"):
-        export_lerobot(material, tmp_path / "set", Exported())
+    both = {"camera/image": streams["camera/image"], "camera.image": streams["camera/image"]}
+    with pytest.raises(RecordingError, match=r"camera\.image and camera/image are both"):
+        exported(of_robot(tmp_path / "a.mcap", both), export_lerobot, tmp_path / "set")
 
 
 def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
-    with Material(write(tmp_path / "a.mcap", arm())) as material:
-        export_lerobot(material, tmp_path / "set", Exported())
+    exported(of_robot(tmp_path / "a.mcap", arm()), export_lerobot, tmp_path / "set")
 
     table = pq.read_table(tmp_path / "set/data/chunk-000/episode_000000.parquet")
     states = np.array(table["observation.state"].to_pylist())
     stats = json.loads((tmp_path / "set/meta/episodes_stats.jsonl").read_text())["stats"]
     found = stats["observation.state"]
-    for name, expected in (
-        ("min", states.min(0)),
-        ("max", states.max(0)),
-        ("mean", states.mean(0)),
-        ("std", states.std(0)),
-    ):
-        assert np.allclose(found[name], expected)
+    for name in ("min", "max", "mean", "std"):
+        assert np.allclose(found[name], getattr(states, name)(0))
     assert found["count"] == [len(states)]
     assert np.array(stats["observation.images.camera.image"]["mean"]).shape == (3, 1, 1)
     assert json.loads((tmp_path / "set/meta/episodes.jsonl").read_text())["length"] == len(states)
     assert b"huggingface" in table.schema.metadata
 
 
-def test_a_lerobot_dataset_of_format_3_says_which_rows_of_which_file_an_episode_is(tmp_path: Path) -> None:
+def test_a_lerobot_dataset_of_format_3_locates_its_episodes(tmp_path: Path) -> None:
     """What LeRobot 3 reads, in its order: info, tasks by their text, episodes, then the rows of an episode."""
     pd = pytest.importorskip("pandas")
-    path, done = write(tmp_path / "a.mcap", arm()), Exported()
-    with Material(path) as material:
-        export_lerobot(material, tmp_path / "set", done, layout=Layout30(), action="cmd/twist", task="pick it up")
-    with Material(path) as material:
-        export_lerobot(material, tmp_path / "old", Exported(), action="cmd/twist", task="pick it up")
+    path = of_robot(tmp_path / "a.mcap", arm())
+    done = exported(path, export_lerobot, tmp_path / "set", layout=Layout30(), action="cmd/twist", task="pick it up")
+    exported(path, export_lerobot, tmp_path / "old", action="cmd/twist", task="pick it up")
 
     meta = tmp_path / "set/meta"
     info = json.loads((meta / "info.json").read_text())
@@ -184,17 +159,18 @@ def test_a_stream_whose_messages_change_in_size_is_named_with_what_leaves_it_out
     late = Image(stamp=START + 12 * SECOND // 10, frame="c", data=np.zeros((12, 16, 3), np.uint8))
     streams["arm/joints"].append(longer)
     streams["camera/image"].append(late)
-    path = write(tmp_path / "a.mcap", streams)
+    path = of_robot(tmp_path / "a.mcap", streams)
 
-    with Material(path) as material, pytest.raises(RecordingError, match=r"--without robot1/arm/joints$"):
-        export_lerobot(material, tmp_path / "set", Exported(), action="cmd/twist")
+    with pytest.raises(RecordingError, match=r"--without robot1/arm/joints$"):
+        exported(path, export_lerobot, tmp_path / "set", action="cmd/twist")
 
 
 def test_a_single_number_is_a_number_in_the_table_as_lerobot_takes_it(tmp_path: Path) -> None:
     streams = arm()
     streams["arm/joints"] = [Number(stamp=m.stamp, value=float(k)) for k, m in enumerate(streams["camera/image"])]
-    with Material(write(tmp_path / "a.mcap", streams)) as material:
-        export_lerobot(material, tmp_path / "set", Exported(), layout=Layout30(), action="cmd/twist")
+    exported(
+        of_robot(tmp_path / "a.mcap", streams), export_lerobot, tmp_path / "set", layout=Layout30(), action="cmd/twist"
+    )
 
     table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
@@ -204,25 +180,19 @@ def test_a_single_number_is_a_number_in_the_table_as_lerobot_takes_it(tmp_path: 
 
 
 def test_the_command_writes_format_3(tmp_path: Path) -> None:
-    command = [
-        "convert",
-        str(write(tmp_path / "a.mcap", arm())),
-        str(tmp_path / "set"),
-        "--quiet",
-        "--to",
-        "lerobot-v3",
-    ]
-    shown = CliRunner().invoke(app, [*command, "--action", "cmd/twist"])
+    path = of_robot(tmp_path / "a.mcap", arm())
+    words = ["convert", str(path), str(tmp_path / "set"), "--quiet", "--to", "lerobot-v3", "--action", "cmd/twist"]
+    shown = CliRunner().invoke(app, words)
     assert shown.exit_code == 0, shown.output
     assert json.loads((tmp_path / "set/meta/info.json").read_text())["codebase_version"] == "v3.0"
 
 
 def test_a_dataset_without_images_or_with_another_action_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", {"said": [Text(stamp=START, text="go")]})
-    with Material(path) as material, pytest.raises(RecordingError, match="takes images"):
-        export_lerobot(material, tmp_path / "set", Exported())
-    with Material(write(tmp_path / "b.mcap", arm())) as material, pytest.raises(RecordingError, match="no stream 'go'"):
-        export_lerobot(material, tmp_path / "set", Exported(), action="go")
+    path = of_robot(tmp_path / "a.mcap", {"said": [Text(stamp=START, text="go")]})
+    with pytest.raises(RecordingError, match="takes images"):
+        exported(path, export_lerobot, tmp_path / "set")
+    with pytest.raises(RecordingError, match="no stream 'go'"):
+        exported(of_robot(tmp_path / "b.mcap", arm()), export_lerobot, tmp_path / "set", action="go")
 
 
 def drive() -> dict[str, list[Message]]:
@@ -251,61 +221,52 @@ def drive() -> dict[str, list[Message]]:
 
 
 def test_a_kitti_raw_drive_is_read_back_by_its_reader(tmp_path: Path) -> None:
-    streams, done = drive(), Exported()
-    with Material(write(tmp_path / "a.mcap", streams, ("camera/info", "tf"))) as material:
-        export_kitti_raw(material, tmp_path / "out", done)
+    streams = drive()
+    done = exported(of_robot(tmp_path / "a.mcap", streams, ("camera/info", "tf")), export_kitti_raw, tmp_path / "out")
 
     folder = tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync"
-    source = KittiRaw(path=str(folder))
-    source.setup()
-    static, steps = source.static_outputs(), list(source.stream())
+    dataset = KittiRaw(path=str(folder))
+    dataset.setup()
+    static, steps = dataset.static_outputs(), list(dataset.stream())
     assert len(steps) == 4
     for step, image, scan in zip(steps, streams["camera/image"], streams["lidar/points"], strict=False):
         assert step["points"].stamp == scan.stamp
-        assert np.array_equal(step["points"].points, scan.points)  # type: ignore[attr-defined]
-        assert np.array_equal(step["points"].intensities, scan.intensities)  # type: ignore[attr-defined]
-        assert np.array_equal(step["image"].data, image.data)  # type: ignore[attr-defined]
+        assert np.array_equal(step["points"].points, scan.points)
+        assert np.array_equal(step["points"].intensities, scan.intensities)
+        assert np.array_equal(step["image"].data, image.data)
     placed = static["extrinsics"]
-    assert np.allclose(placed.translations, [[0.1, 0.2, 0.3]])  # type: ignore[attr-defined]
-    assert np.allclose(np.abs(placed.rotations), 0.5)  # type: ignore[attr-defined]
-    assert np.allclose(static["image_info"].K[0, 0], 50.0)  # type: ignore[attr-defined]
+    assert np.allclose(placed.translations, [[0.1, 0.2, 0.3]])
+    assert np.allclose(np.abs(placed.rotations), 0.5)
+    assert np.allclose(static["image_info"].K[0, 0], 50.0)
     assert not done.left_out
 
 
-def test_what_a_kitti_raw_drive_lacks_is_said(tmp_path: Path) -> None:
-    streams, done = drive(), Exported()
+def test_files_missing_from_a_kitti_raw_drive_are_reported(tmp_path: Path) -> None:
+    streams = drive()
     del streams["camera/info"], streams["tf"]
-    with Material(write(tmp_path / "a.mcap", streams)) as material:
-        export_kitti_raw(material, tmp_path / "out", done)
+    done = exported(of_robot(tmp_path / "a.mcap", streams), export_kitti_raw, tmp_path / "out")
 
     assert set(done.left_out) == {"calib_cam_to_cam.txt", "calib_velo_to_cam.txt"}
-    assert (
-        len((tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync/image_02/timestamps.txt").read_text().splitlines())
-        == 4
-    )
+    times = tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync/image_02/timestamps.txt"
+    assert len(times.read_text().splitlines()) == 4
 
 
 def stereo(path: Path, missing: set[tuple[str, int]]) -> Path:
-    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
+    streams: dict[str, list[Message]] = {"left": [], "right": [], "pose": []}
+    for k in range(5):
+        stamp = (k + 1) * SECOND // 10
         for name in ("left", "right"):
-            writer.add_stream(f"robot1/{name}", Image)
-        writer.add_stream("robot1/pose", Pose)
-        for k in range(5):
-            stamp = (k + 1) * SECOND // 10
-            for name in ("left", "right"):
-                if (name, k) not in missing:
-                    image = Image(stamp=stamp, frame=name, data=np.full((4, 6), 10 * k, np.uint8))
-                    writer.write(f"robot1/{name}", image, seq=k)
-            place = [k, 0, 0] if k != 2 else [float("nan"), 0, 0]
-            pose = Pose(stamp=stamp + 1000, frame="map", position=np.array(place), orientation=[0, 0, 0, 1])
-            writer.write("robot1/pose", pose, seq=k)
-    return path
+            if (name, k) not in missing:
+                streams[name].append(Image(stamp=stamp, frame=name, data=np.full((4, 6), 10 * k, np.uint8)))
+        place = [k if k != 2 else float("nan"), 0, 0]
+        streams["pose"].append(Pose(stamp=stamp + 1000, frame="map", position=place, orientation=[0, 0, 0, 1]))
+    return of_robot(path, streams)
 
 
 def test_an_image_without_one_of_the_other_camera_is_left_out_and_counted(tmp_path: Path) -> None:
-    done = Exported()
-    with Material(stereo(tmp_path / "a.mcap", {("left", 1), ("right", 2), ("right", 4)})) as material:
-        export_kitti(material, tmp_path / "kitti", done)
+    done = exported(
+        stereo(tmp_path / "a.mcap", {("left", 1), ("right", 2), ("right", 4)}), export_kitti, tmp_path / "kitti"
+    )
 
     assert len(list((tmp_path / "kitti" / "image_0").iterdir())) == 2
     assert [cv2.imread(str(tmp_path / "kitti" / "image_1" / f"00000{k}.png"), 0)[0, 0] for k in (0, 1)] == [0, 30]
@@ -316,9 +277,7 @@ def test_an_image_without_one_of_the_other_camera_is_left_out_and_counted(tmp_pa
 
 
 def test_a_pose_that_is_none_is_left_out_of_a_trajectory_and_counted(tmp_path: Path) -> None:
-    done = Exported()
-    with Material(stereo(tmp_path / "a.mcap", set()), ["robot1/pose"]) as material:
-        export_tum(material, tmp_path / "tum", done)
+    done = exported(stereo(tmp_path / "a.mcap", set()), export_tum, tmp_path / "tum", ["robot1/pose"])
 
     assert np.loadtxt(tmp_path / "tum" / "groundtruth.txt")[:, 1].tolist() == [0, 1, 3, 4]
     assert done.lost == {"pose": {"a pose that is not finite, left out": 1}}
@@ -326,20 +285,16 @@ def test_a_pose_that_is_none_is_left_out_of_a_trajectory_and_counted(tmp_path: P
 
 def test_frames_are_paired_without_holding_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Colour is 5 ms behind depth; images in memory are those near a frame that still waits for others."""
-    path, held = tmp_path / "a.mcap", []
-    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
-        writer.add_stream("robot1/color", Image)
-        writer.add_stream("robot1/depth", DepthImage)
-        for k in range(60):
-            stamp = (k + 1) * SECOND // 30
-            color = Image(stamp=stamp + 5_000_000, frame="c", data=np.full((4, 6, 3), k, np.uint8))
-            writer.write("robot1/color", color, seq=k)
-            writer.write("robot1/depth", DepthImage(stamp=stamp, frame="c", data=np.ones((4, 6), np.float32)), seq=k)
-    nearest = frames._nearest
-    monkeypatch.setattr(frames, "_nearest", lambda found, stamp: (held.append(len(found)), nearest(found, stamp))[1])
+    held, streams = [], {"color": list[Message](), "depth": list[Message]()}
+    for k in range(60):
+        stamp = (k + 1) * SECOND // 30
+        pixels = np.full((4, 6, 3), k, np.uint8)
+        streams["color"].append(Image(stamp=stamp + 5_000_000, frame="c", data=pixels))
+        streams["depth"].append(DepthImage(stamp=stamp, frame="c", data=np.ones((4, 6), np.float32)))
+    nearest = frames.nearest
+    monkeypatch.setattr(frames, "nearest", lambda found, stamp: (held.append(len(found)), nearest(found, stamp))[1])
 
-    with Material(path) as material:
-        export_7scenes(material, tmp_path / "scenes", Exported())
+    exported(of_robot(tmp_path / "a.mcap", streams), export_7scenes, tmp_path / "scenes")
 
     assert max(held) <= 3
     assert [cv2.imread(str(tmp_path / "scenes" / f"frame-{k:06d}.color.png"))[0, 0, 0] for k in (0, 59)] == [0, 59]
@@ -352,24 +307,18 @@ def lens(frame: str, focal: float, distortion: list[float] | None = None) -> Cam
     return CameraInfo(stamp=START, frame=frame, width=16, height=12, K=K, distortion_model=model, distortion=found)
 
 
-def test_a_kitti_camera_gets_its_own_calibration_and_what_has_no_place_is_said(tmp_path: Path) -> None:
-    mounted = Transforms(
-        stamp=START,
-        frames=("c",),
-        child_frames=("d",),
-        translations=np.zeros((1, 3)),
-        rotations=np.array([[0, 0, 0, 1.0]]),
-    )
-    streams: dict[str, list[Message]] = {
+def test_a_kitti_camera_gets_its_own_calibration_and_the_rest_is_reported(tmp_path: Path) -> None:
+    mounted = Transforms.from_matrix(np.eye(4), stamp=START, frame="c", child_frame="d")
+    streams = {
         "a/info": [lens("d", 100)],
         "b/info": [lens("c", 50, [0.1, 0, 0, 0, 0])],
         "camera/image": arm()["camera/image"],
         "mounting": [mounted],
     }
     done = Exported()
-    with Material(write(tmp_path / "a.mcap", streams, static=("a/info", "b/info", "mounting"))) as material:
-        DATASETS["kitti"](material, tmp_path / "set", done)
-        tell_untaken(material, "kitti", done)
+    with ExportSource(of_robot(tmp_path / "a.mcap", streams, static=("a/info", "b/info", "mounting"))) as source:
+        DATASETS["kitti"](source, tmp_path / "set", done)
+        tell_untaken(source, "kitti", done)
 
     assert (tmp_path / "set/calib.txt").read_text().startswith("P0: 5.0")
     assert done.left_out.keys() == {"a/info", "mounting"}

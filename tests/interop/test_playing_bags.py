@@ -71,15 +71,15 @@ def test_mapping_that_is_not_clear_is_an_error_with_the_topics_and_the_proposal(
 
 
 def test_bag_replayed_in_this_process_is_recorded_and_verified(graph: Path, bag: Path, tmp_path: Path) -> None:
+    from dataflow.cli.support.arguments import BagOptions
     from dataflow.cli.support.bags import replay_bag
     from dataflow.cli.support.execution import Outputs
+    from dataflow.cli.support.run_options import ReportOptions
 
     loaded, file = load_graph(graph), tmp_path / "out.mcap"
     outputs = Outputs(file, None, None, False, False)
     options = {"placement": "one_process", "record": file}
-    replay_bag(
-        bag, loaded, MAPS, "auto", None, None, outputs, options, began=0.0, json=False, quiet=True, verbose=False
-    )
+    replay_bag(bag, loaded, BagOptions(MAPS), None, None, outputs, options, ReportOptions(quiet=True), began=0.0)
 
     with Recording(file) as made:
         assert made.metadata["dataflow:bag"]["clock"] == "header: when it was measured"

@@ -6,52 +6,60 @@ import gzip
 import shutil
 import sqlite3
 import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zstandard
-from made_bags import ROS1, ROS2, SECOND, imus, ros, transform, write_ros2
-from mcap.writer import Writer
+from exporting import exported
+from made_bags import ROS1, ROS2, SECOND, imus, ros, transform, write_ros1, write_ros2
+from made_recordings import foreign
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from dataflow.interop.bag import BagError, shortfalls, surpluses
+from dataflow.interop.bag import Bag, BagError, shortfalls, surpluses
 from dataflow.interop.export.foxglove import export_foxglove
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
 from dataflow.interop.export.ros2 import export_ros2
+from dataflow.interop.export.source import ExportSource
 from dataflow.interop.opening import open_bag
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(20)]
 
 
+Opened = Callable[[Path], Bag]
+
+
+@pytest.fixture
+def opened() -> Iterator[Opened]:
+    """Opens bags, which are closed at the end."""
+    with ExitStack() as stack:
+        yield lambda path: stack.enter_context(closing(open_bag(path)))
+
+
 def counted(path: Path) -> dict[str, int]:
     """Messages by topic, as they come."""
-    bag = open_bag(path)
-    found = dict.fromkeys(bag.topics, 0)
-    for stored in bag.messages(list(bag.topics)):
-        found[stored.topic] += 1
-    assert found == {name: topic.count for name, topic in bag.topics.items()}
-    bag.close()
+    with closing(open_bag(path)) as bag:
+        found = dict.fromkeys(bag.topics, 0) | Counter(stored.topic for stored in bag.messages(list(bag.topics)))
+        assert found == {name: topic.count for name, topic in bag.topics.items()}
     return found
 
 
 def write_mcap(path: Path, rows: list[tuple[str, int, Any]]) -> None:
     """An MCAP of ROS 2 messages, whatever their topics are called."""
-    with path.open("wb") as opened:
-        writer = Writer(opened)
-        writer.start("ros2", "other")
-        channels: dict[str, int] = {}
-        for topic, time, message in rows:
-            kind = message.__msgtype__
-            if topic not in channels:
-                text = ROS2.generate_msgdef(kind, ros_version=2)[0].encode()
-                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
-            writer.add_message(channels[topic], time, bytes(ROS2.serialize_cdr(message, kind)), time)
-        writer.finish()
+    topics = []
+    for topic in dict.fromkeys(topic for topic, _, _ in rows):
+        messages = [(time, message) for name, time, message in rows if name == topic]
+        kind = messages[0][1].__msgtype__
+        schema = (kind, "ros2msg", ROS2.generate_msgdef(kind, ros_version=2)[0].encode())
+        data = [(time, bytes(ROS2.serialize_cdr(message, kind))) for time, message in messages]
+        topics.append((topic, "cdr", schema, data))
+    foreign(path, *topics, profile="ros2")
 
 
 def changed(folder: Path, statement: str, *values: object) -> None:
@@ -68,18 +76,18 @@ def test_profiles_that_differ_between_metadata_and_database_lose_nothing(tmp_pat
     assert counted(folder) == {"/imu": 20}
 
 
-def test_messages_that_metadata_promise_and_the_database_lacks_are_told(tmp_path: Path) -> None:
+def test_messages_missing_from_the_database_are_reported(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     changed(folder, "delete from messages where id > 12")
 
-    bag = open_bag(folder)
-
+    bag = opened(folder)
     assert shortfalls(bag) == ["topic /imu: 20 messages are promised, 12 are there"]
-    bag.close()
 
 
 @pytest.mark.parametrize("read_only", [False, True])
-def test_what_a_killed_recorder_left_in_the_write_ahead_log_is_read(tmp_path: Path, read_only: bool) -> None:
+def test_what_a_killed_recorder_left_in_the_write_ahead_log_is_read(
+    opened: Opened, tmp_path: Path, read_only: bool
+) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     database = sqlite3.connect(folder / "bag.db3")
     database.execute("pragma journal_mode=wal")
@@ -94,22 +102,20 @@ def test_what_a_killed_recorder_left_in_the_write_ahead_log_is_read(tmp_path: Pa
     if read_only:
         killed.chmod(0o500)
 
-    bag = open_bag(killed)
+    bag = opened(killed)
 
     assert bag.topics["/imu"].count == 21
     assert any("bag.db3-wal" in note for note in bag.notes)
-    bag.close()
     killed.chmod(0o700)
 
 
-def test_a_database_that_was_renamed_is_read_with_a_note(tmp_path: Path) -> None:
+def test_a_database_that_was_renamed_is_read_with_a_note(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     (folder / "bag.db3").rename(folder / "other.db3")
 
     assert counted(folder) == {"/imu": 20}
-    bag = open_bag(folder)
+    bag = opened(folder)
     assert bag.notes == ("metadata.yaml names bag.db3, which the folder lacks",)
-    bag.close()
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
@@ -126,7 +132,7 @@ def test_files_compressed_as_a_whole_are_read(tmp_path: Path, storage: str, meta
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_messages_compressed_one_by_one_are_read(opened: Opened, tmp_path: Path, storage: StoragePlugin) -> None:
     rows = imus(STAMPS)
     kind = "sensor_msgs/msg/Imu"
     writer = Writer2(tmp_path / "bag", version=9, storage_plugin=storage)
@@ -136,23 +142,21 @@ def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: Storag
         for _, time, message in rows:
             writer.write(connection, time, ROS2.serialize_cdr(message, kind))
 
-    bag = open_bag(tmp_path / "bag")
+    bag = opened(tmp_path / "bag")
 
     assert [bytes(s.data) for s in bag.messages(["/imu"])] == [bytes(ROS2.serialize_cdr(m, kind)) for _, _, m in rows]
-    bag.close()
 
 
-def test_split_databases_are_one_bag_in_the_order_of_log_times(tmp_path: Path) -> None:
+def test_split_databases_are_one_bag_in_the_order_of_log_times(opened: Opened, tmp_path: Path) -> None:
     rows = imus(STAMPS)
     first, second = write_ros2(tmp_path / "a", rows[10:], "sqlite3"), write_ros2(tmp_path / "b", rows[:10], "sqlite3")
     (first / "metadata.yaml").unlink()
     (first / "a.db3").rename(first / "run_1.db3")
     shutil.copy(second / "b.db3", first / "run_0.db3")
 
-    bag = open_bag(first)
+    bag = opened(first)
 
     assert [stored.log_time for stored in bag.messages(["/imu"])] == STAMPS
-    bag.close()
 
 
 def test_metadata_that_are_no_yaml_are_noted_and_the_files_count(tmp_path: Path) -> None:
@@ -162,7 +166,7 @@ def test_metadata_that_are_no_yaml_are_noted_and_the_files_count(tmp_path: Path)
     assert counted(folder) == {"/imu": 20}
 
 
-def test_one_layout_under_two_names_is_one_topic_and_two_layouts_are_two(tmp_path: Path) -> None:
+def test_one_layout_under_two_names_is_one_topic_and_two_layouts_are_two(opened: Opened, tmp_path: Path) -> None:
     text = ROS1.types["std_msgs/msg/String"](data="x")
     with Writer1(tmp_path / "two.bag") as writer:
         first = writer.add_connection("/said", "std_msgs/msg/String", typestore=ROS1)
@@ -174,10 +178,9 @@ def test_one_layout_under_two_names_is_one_topic_and_two_layouts_are_two(tmp_pat
         writer.write(other, STAMPS[7], ROS1.serialize_ros1(number, "std_msgs/msg/Float64"))
 
     assert counted(tmp_path / "two.bag") == {"/said": 6, "/said (std_msgs/msg/Float64)": 1}
-    bag = open_bag(tmp_path / "two.bag")
+    bag = opened(tmp_path / "two.bag")
     assert "two types" in bag.notes[0]
     assert shortfalls(bag) == surpluses(bag) == []
-    bag.close()
 
 
 def test_a_file_without_tables_is_no_bag(tmp_path: Path) -> None:
@@ -203,30 +206,27 @@ def test_a_file_that_metadata_name_twice_is_read_once(tmp_path: Path) -> None:
     assert counted(folder) == {"/imu": 20}
 
 
-def test_more_messages_than_metadata_promise_are_told_and_are_no_shortfall(tmp_path: Path) -> None:
+def test_more_messages_than_metadata_promise_are_noted_and_no_shortfall(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS))
     text = (folder / "metadata.yaml").read_text()
     (folder / "metadata.yaml").write_text(text.replace("message_count: 20", "message_count: 4"))
 
-    bag = open_bag(folder)
-
+    bag = opened(folder)
     assert bag.notes == ("topic /imu: 4 messages are promised, 20 are there",)
     assert not shortfalls(bag)
-    bag.close()
 
 
-def test_a_part_that_is_missing_between_numbered_files_is_told(tmp_path: Path) -> None:
+def test_a_missing_numbered_file_is_noted(opened: Opened, tmp_path: Path) -> None:
     for number in (0, 1, 3):
         part = write_ros2(tmp_path / f"drive_{number}", imus(STAMPS[number : number + 1]))
         (tmp_path / f"drive_{number}.mcap").write_bytes((part / f"drive_{number}.mcap").read_bytes())
 
-    bag = open_bag(tmp_path)
+    bag = opened(tmp_path)
 
     assert bag.notes == ("the files are numbered, and 2 is not there",)
-    bag.close()
 
 
-def test_what_a_killed_recorder_had_half_written_is_taken_back(tmp_path: Path) -> None:
+def test_what_a_killed_recorder_had_half_written_is_taken_back(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     before = (folder / "bag.db3").read_bytes()
     database = sqlite3.connect(folder / "bag.db3", isolation_level=None)
@@ -238,27 +238,25 @@ def test_what_a_killed_recorder_had_half_written_is_taken_back(tmp_path: Path) -
     database.close()
     assert (tmp_path / "bag.db3").read_bytes() != before
 
-    bag = open_bag(tmp_path / "bag.db3")
+    bag = opened(tmp_path / "bag.db3")
 
-    assert [len(stored.data) for stored in bag.messages(["/imu"])] == [len(ROS2.serialize_cdr(m, m.__msgtype__))
-                                                                       for _, _, m in imus(STAMPS)]  # fmt: skip
+    sizes = [len(ROS2.serialize_cdr(message, message.__msgtype__)) for _, _, message in imus(STAMPS)]
+    assert [len(stored.data) for stored in bag.messages(["/imu"])] == sizes
     assert bag.notes == ("bag.db3 was not closed by its recorder: what it wrote last is taken back",)
-    bag.close()
 
 
 @pytest.mark.parametrize("column", ["timestamp", "data"])
-def test_rows_that_are_no_messages_are_counted(tmp_path: Path, column: str) -> None:
+def test_rows_that_are_no_messages_are_counted(opened: Opened, tmp_path: Path, column: str) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     changed(folder, f"update messages set {column} = ? where id = 3", "text")
 
     assert counted(folder) == {"/imu": 19}
-    bag = open_bag(folder)
+    bag = opened(folder)
     assert bag.notes == ("bag.db3: rows without a whole time or bytes, which are no messages: 1",)
     assert shortfalls(bag)
-    bag.close()
 
 
-def test_messages_that_are_zstd_frames_without_their_size_are_read(tmp_path: Path) -> None:
+def test_messages_that_are_zstd_frames_without_their_size_are_read(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     packer = zstandard.ZstdCompressor(write_content_size=False)
     with sqlite3.connect(folder / "bag.db3") as database:
@@ -268,42 +266,36 @@ def test_messages_that_are_zstd_frames_without_their_size_are_read(tmp_path: Pat
     text = (folder / "metadata.yaml").read_text().replace("compression_mode: ''", "compression_mode: MESSAGE")
     (folder / "metadata.yaml").write_text(text.replace("compression_format: ''", "compression_format: zstd"))
 
-    bag = open_bag(folder)
+    bag = opened(folder)
 
     message = imus(STAMPS)[0][2]
     assert next(iter(bag.messages(["/imu"]))).data == ROS2.serialize_cdr(message, message.__msgtype__)
-    bag.close()
 
 
 def numbers(file: Path, values: range) -> None:
-    with Writer1(file) as writer:
-        kind = "std_msgs/msg/Float64"
-        connection = writer.add_connection("/n", kind, typestore=ROS1)
-        for value in values:
-            message = ros("std_msgs/Float64", ROS1, data=float(value))
-            writer.write(connection, STAMPS[value], ROS1.serialize_ros1(message, kind))
+    write_ros1(file, [("/n", STAMPS[k], ros("std_msgs/Float64", ROS1, data=float(k))) for k in values])
 
 
-def test_a_chunk_of_a_connection_that_the_bag_does_not_describe_promises_nothing(tmp_path: Path) -> None:
+def test_a_chunk_of_a_connection_that_the_bag_does_not_describe_promises_nothing(
+    opened: Opened, tmp_path: Path
+) -> None:
     numbers(tmp_path / "n.bag", range(4))
     content = (tmp_path / "n.bag").read_bytes()
     assert content.endswith(struct.pack("<II", 0, 4))  # connection and count of the last chunk's
     (tmp_path / "n.bag").write_bytes(content[:-8] + struct.pack("<II", 7, 4))
 
-    bag = open_bag(tmp_path / "n.bag")
+    bag = opened(tmp_path / "n.bag")
     assert (bag.promised, len(list(bag.messages(["/n"])))) == ({}, 4)
-    bag.close()
 
 
-def test_the_parts_of_a_split_ros_1_recording_are_one_bag(tmp_path: Path) -> None:
+def test_the_parts_of_a_split_ros_1_recording_are_one_bag(opened: Opened, tmp_path: Path) -> None:
     numbers(tmp_path / "drive_2023-01-01-10-00-30_1.bag", range(4, 9))
     numbers(tmp_path / "drive_2023-01-01-10-00-00_0.bag", range(4))
 
-    bag = open_bag(tmp_path)
+    bag = opened(tmp_path)
 
     assert [(s.number, s.log_time) for s in bag.messages(["/n"])] == list(enumerate(STAMPS[:9]))
     assert bag.kind == "ROS 1 bag, 2 files"
-    bag.close()
 
 
 def test_ros_1_bags_of_other_names_are_separate_recordings(tmp_path: Path) -> None:
@@ -314,7 +306,7 @@ def test_ros_1_bags_of_other_names_are_separate_recordings(tmp_path: Path) -> No
         open_bag(tmp_path)
 
 
-def test_messages_that_a_ros_1_chunk_counts_and_the_index_lacks_are_told(tmp_path: Path) -> None:
+def test_messages_missing_from_the_index_of_a_ros_1_bag_are_reported(opened: Opened, tmp_path: Path) -> None:
     numbers(tmp_path / "x.bag", range(5))
     data = bytearray((tmp_path / "x.bag").read_bytes())
     info = data.rfind(b"op=\x06")
@@ -322,49 +314,44 @@ def test_messages_that_a_ros_1_chunk_counts_and_the_index_lacks_are_told(tmp_pat
     data[counted_at : counted_at + 4] = (9).to_bytes(4, "little")
     (tmp_path / "x.bag").write_bytes(data)
 
-    bag = open_bag(tmp_path / "x.bag")
+    bag = opened(tmp_path / "x.bag")
 
     assert shortfalls(bag) == ["topic /n: 9 messages are promised, 5 are there"]
-    bag.close()
 
 
-def test_a_topic_of_two_definitions_goes_to_ros_2_as_both(tmp_path: Path) -> None:
+def test_a_topic_of_two_definitions_goes_to_ros_2_as_both(opened: Opened, tmp_path: Path) -> None:
     with Writer1(tmp_path / "x.bag") as writer:
-        for count_, digest in ((1, "1" * 32), (2, "2" * 32)):
-            text = "".join(f"float64 v{i}\n" for i in range(count_))
-            connection = writer.add_connection("/n", "my/msg/T", msgdef=text, md5sum=digest)
-            for stamp in STAMPS[:count_]:
-                writer.write(connection, stamp, bytes(8 * count_))
+        for count in (1, 2):
+            text = "".join(f"float64 v{i}\n" for i in range(count))
+            connection = writer.add_connection("/n", "my/msg/T", msgdef=text, md5sum=str(count) * 32)
+            for stamp in STAMPS[:count]:
+                writer.write(connection, stamp, bytes(8 * count))
 
-    with Material(tmp_path / "x.bag") as material:
-        export_ros2(material, tmp_path / "out", Exported())
+    exported(tmp_path / "x.bag", export_ros2, tmp_path / "out")
 
-    bag = open_bag(tmp_path / "out")
+    bag = opened(tmp_path / "out")
     assert {name: topic.count for name, topic in bag.topics.items()} == {"/n": 2, "/n (my/msg/T)": 1}
     assert [len(stored.data) for stored in bag.messages(["/n"])] == [4 + 16] * 2
-    bag.close()
 
 
 @pytest.mark.parametrize("form", ["own", "ros2", "foxglove"])
-def test_topics_whose_names_differ_by_a_slash_stay_apart(tmp_path: Path, form: str) -> None:
+def test_topics_whose_names_differ_by_a_slash_stay_apart(opened: Opened, tmp_path: Path, form: str) -> None:
     topics = ("/a/b", "a/b", "/a/b/", "/c: #d")
     rows = [(name, stamp, ros("std_msgs/String", data=name)) for name in topics for stamp in STAMPS[:3]]
     write_mcap(tmp_path / "x.mcap", rows)
     out = tmp_path / ("out" if form == "ros2" else "out.mcap")
 
-    with Material(tmp_path / "x.mcap") as material:
-        {"own": export_own, "ros2": export_ros2, "foxglove": export_foxglove}[form](material, out, Exported())
+    with ExportSource(tmp_path / "x.mcap") as source:
+        {"own": export_own, "ros2": export_ros2, "foxglove": export_foxglove}[form](source, out, Exported())
 
-    found = counted(out)
-    assert sorted(found.values()) == [3, 3, 3, 3]
+    assert sorted(counted(out).values()) == [3, 3, 3, 3]
     if form == "own":
-        assert material.account.notes == [
+        assert source.account.notes == [
             "topic /a/b is the stream a/b_2, since a/b is taken",
             "topic /a/b/ is the stream a/b_3, since a/b is taken",
         ]
-    bag = open_bag(out)
+    bag = opened(out)
     assert not bag.notes
-    bag.close()
 
 
 def test_a_folder_of_bags_names_them_and_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:

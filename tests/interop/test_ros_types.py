@@ -39,23 +39,14 @@ def test_every_mapped_type_is_a_type_of_ros() -> None:
 
 
 def test_image_and_depth_are_told_apart_by_encoding() -> None:
-    colour = ros(
-        "sensor_msgs/Image",
-        header=header(1, "c"),
-        height=1,
-        width=1,
-        encoding="bgr8",
-        step=3,
-        data=flat(np.uint8([1, 2, 3])),
+    bgr = {"encoding": "bgr8", "step": 3, "data": flat(np.uint8([1, 2, 3]))}
+    deep = {"encoding": "16UC1", "step": 2, "data": flat(np.uint16([1500]))}
+    colour, depth = (
+        converted(ros("sensor_msgs/Image", header=header(1, "c"), height=1, width=1, **one)) for one in (bgr, deep)
     )
-    depth = ros("sensor_msgs/Image", height=1, width=1, encoding="16UC1", step=2, data=flat(np.uint16([1500])))
 
-    assert (type(converted(colour)), converted(colour).frame, converted(colour).data.tolist()) == (
-        Image,
-        "c",
-        [[[3, 2, 1]]],
-    )
-    assert (type(converted(depth)), converted(depth).data.tolist()) == (DepthImage, [[1.5]])
+    assert (type(colour), colour.frame, colour.data.tolist()) == (Image, "c", [[[3, 2, 1]]])
+    assert (type(depth), depth.data.tolist()) == (DepthImage, [[1.5]])
 
 
 def test_compressed_image_decodes_to_its_pixels() -> None:
@@ -70,27 +61,15 @@ def test_compressed_image_decodes_to_its_pixels() -> None:
 
 
 def test_compressed_depth_of_both_kinds_decodes_to_metres() -> None:
-    millimetres = np.array([[0, 1500, 40000]], np.uint16)
-    png = cv2.imencode(".png", millimetres)[1].tobytes()
-    plain = ros(
-        "sensor_msgs/CompressedImage",
-        format="16UC1; compressedDepth png",
-        data=flat(np.frombuffer(struct.pack("<iff", 0, 0.0, 0.0) + png, np.uint8)),
-    )
-    scale, offset = 100.0, 9.0  # inverse depth: metres = scale / (value - offset)
-    inverse = ros(
-        "sensor_msgs/CompressedImage",
-        format="32FC1; compressedDepth png",
-        data=flat(
-            np.frombuffer(
-                struct.pack("<iff", 0, scale, offset) + cv2.imencode(".png", np.uint16([[0, 59]]))[1].tobytes(),
-                np.uint8,
-            )
-        ),
-    )
+    def sent(kind: str, pixels: np.ndarray, *scale: float) -> Any:
+        data = struct.pack("<iff", 0, *scale) + cv2.imencode(".png", pixels)[1].tobytes()
+        return ros("sensor_msgs/CompressedImage", format=f"{kind}; compressedDepth png", data=flat(np.uint8([*data])))
 
-    np.testing.assert_allclose(convert(converted(plain), DepthImage).data, [[0, 1.5, 40.0]])
-    np.testing.assert_allclose(convert(converted(inverse), DepthImage).data, [[0, 2.0]])
+    plain = converted(sent("16UC1", np.uint16([[0, 1500, 40000]]), 0.0, 0.0))
+    inverse = converted(sent("32FC1", np.uint16([[0, 59]]), 100.0, 9.0))  # metres = 100 / (value - 9)
+
+    np.testing.assert_allclose(convert(plain, DepthImage).data, [[0, 1.5, 40.0]])
+    np.testing.assert_allclose(convert(inverse, DepthImage).data, [[0, 2.0]])
     with pytest.raises(RecordingError, match="RVL image of 0 pixels"):
         converted(ros("sensor_msgs/CompressedImage", format="16UC1; compressedDepth rvl", data=np.zeros(20, np.uint8)))
 
@@ -135,28 +114,15 @@ def cloud(dtype: np.dtype, points: list[tuple[Any, ...]], order: str = "<", rows
         made(ROS2, FIELD, {"name": n, "offset": dtype.fields[n][1], "datatype": kinds[dtype[n].str[1:]], "count": 1})
         for n in dtype.names
     ]
-    return ros(
-        "sensor_msgs/PointCloud2",
-        header=header(STAMP),
-        height=rows,
-        width=len(points) // rows,
-        fields=fields,
-        is_bigendian=order == ">",
-        point_step=dtype.itemsize,
-        row_step=dtype.itemsize * len(points) // rows,
-        data=flat(data),
-    )
+    about = {"height": rows, "width": len(points) // rows, "is_bigendian": order == ">"}
+    sizes = {"point_step": dtype.itemsize, "row_step": dtype.itemsize * len(points) // rows}
+    return ros("sensor_msgs/PointCloud2", header=header(STAMP), fields=fields, data=flat(data), **about, **sizes)
 
 
 def test_cloud_with_the_fields_of_a_spinning_lidar_and_others() -> None:
-    layout = np.dtype(
-        {
-            "names": ["x", "y", "z", "reflectivity", "ring", "t", "ambient"],
-            "formats": ["<f4", "<f4", "<f4", "<u2", "<u1", "<u4", "<u2"],
-            "offsets": [0, 4, 8, 16, 20, 24, 30],
-            "itemsize": 48,
-        }
-    )  # padded, as Ouster's
+    names = ["x", "y", "z", "reflectivity", "ring", "t", "ambient"]
+    formats, offsets = ["<f4", "<f4", "<f4", "<u2", "<u1", "<u4", "<u2"], [0, 4, 8, 16, 20, 24, 30]
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": 48})  # padded, as Ouster's
     message = cloud(layout, [(1, 2, 3, 9, 4, 1_000_000, 7), (4, 5, 6, 8, 5, 2_000_000, 7)], rows=2)
 
     found = converted(message)
@@ -192,16 +158,11 @@ def test_cloud_without_z_is_refused_with_its_fields() -> None:
 
 
 def test_imu_without_orientation_and_with_unknown_covariances() -> None:
-    unknown = np.array([-1.0, 0, 0, 0, 0, 0, 0, 0, 0])
-    found = converted(
-        ros(
-            "sensor_msgs/Imu",
-            angular_velocity=xyz(1, 2, 3),
-            orientation=xyzw(0, 0, 0, 1),
-            orientation_covariance=unknown,
-            linear_acceleration_covariance=np.eye(3).ravel(),
-        )
-    )
+    covariances = {
+        "orientation_covariance": np.array([-1.0, *[0] * 8]),
+        "linear_acceleration_covariance": np.eye(3).ravel(),
+    }
+    found = converted(ros("sensor_msgs/Imu", orientation=xyzw(0, 0, 0, 1), **covariances))
 
     assert found.orientation is None
     assert found.orientation_covariance is None
@@ -210,17 +171,8 @@ def test_imu_without_orientation_and_with_unknown_covariances() -> None:
 
 
 def test_scan_angles_follow_from_the_increment() -> None:
-    found = converted(
-        ros(
-            "sensor_msgs/LaserScan",
-            angle_min=-1.0,
-            angle_max=9.0,
-            angle_increment=0.5,
-            range_max=10.0,
-            time_increment=0.01,
-            ranges=np.float32([1, 2, 3]),
-        )
-    )
+    scan = {"angle_min": -1.0, "angle_max": 9.0, "angle_increment": 0.5, "range_max": 10.0, "time_increment": 0.01}
+    found = converted(ros("sensor_msgs/LaserScan", ranges=np.float32([1, 2, 3]), **scan))
 
     assert (found.angle_min, found.angle_max, found.intensities) == (-1.0, 0.0, None)
     np.testing.assert_allclose(found.time_offsets, [0, 0.01, 0.02])
@@ -228,16 +180,8 @@ def test_scan_angles_follow_from_the_increment() -> None:
 
 def test_satellite_fix_without_a_fix() -> None:
     status = ros("sensor_msgs/NavSatStatus", status=-1)
-    found = converted(
-        ros(
-            "sensor_msgs/NavSatFix",
-            status=status,
-            latitude=float("nan"),
-            longitude=float("nan"),
-            position_covariance=np.eye(3).ravel(),
-            position_covariance_type=2,
-        )
-    )
+    fix = {"latitude": float("nan"), "longitude": float("nan"), "position_covariance_type": 2}
+    found = converted(ros("sensor_msgs/NavSatFix", status=status, position_covariance=np.eye(3).ravel(), **fix))
 
     assert (found.status, found.covariance_type) == ("no_fix", "diagonal_known")
 
@@ -307,10 +251,9 @@ def hypothesis(name: str, score: float) -> Any:
 def test_detections_take_the_best_hypothesis() -> None:
     center = ros("vision_msgs/Pose2D", position=ros("vision_msgs/Point2D", x=10.0, y=20.0), theta=np.pi / 2)
     box = ros("vision_msgs/BoundingBox2D", center=center, size_x=4.0, size_y=8.0)
-    flat_one = ros(
-        "vision_msgs/Detection2D", results=[hypothesis("cup", 0.2), hypothesis("mug", 0.7)], bbox=box, id="7"
-    )
-    found = converted(ros("vision_msgs/Detection2DArray", detections=[flat_one]))
+    guesses = [hypothesis("cup", 0.2), hypothesis("mug", 0.7)]
+    one = ros("vision_msgs/Detection2D", results=guesses, bbox=box, id="7")
+    found = converted(ros("vision_msgs/Detection2DArray", detections=[one]))
     solid = ros("vision_msgs/BoundingBox3D", size=xyz(1, 2, 3))
     boxes = converted(ros("vision_msgs/Detection3DArray", detections=[ros("vision_msgs/Detection3D", bbox=solid)]))
 
@@ -325,10 +268,7 @@ def test_markers_that_map_and_one_that_does_not() -> None:
     points = [xyz(1, 0, 0, "Point"), xyz(2, 0, 0, "Point")]
     cubes = converted(ros("visualization_msgs/Marker", type=6, pose=pose, points=points, scale=xyz(1, 1, 1), ns="box"))
     line = converted(ros("visualization_msgs/Marker", type=4, points=points))
-    sphere, cube = (
-        ros("visualization_msgs/Marker", type=2),
-        ros("visualization_msgs/Marker", type=1, scale=xyz(1, 1, 1)),
-    )
+    sphere, cube = (ros("visualization_msgs/Marker", type=kind, scale=xyz(1, 1, 1)) for kind in (2, 1))
     array = converted(ros("visualization_msgs/MarkerArray", markers=[sphere, cube]))
 
     assert isinstance(cubes, Boxes3D)

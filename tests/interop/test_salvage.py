@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +26,10 @@ def saved(path: Path) -> list[tuple[str, int, bytes]]:
 
 
 def held(path: Path) -> dict[str, list[tuple[int, bytes]]]:
-    bag = open_bag(path)
-    found: dict[str, list[tuple[int, bytes]]] = {name: [] for name in bag.topics}
-    for stored in bag.messages(list(bag.topics)):
-        found[stored.topic].append((stored.log_time, bytes(stored.data)))
-    bag.close()
+    with closing(open_bag(path)) as bag:
+        found: dict[str, list[tuple[int, bytes]]] = {name: [] for name in bag.topics}
+        for stored in bag.messages(list(bag.topics)):
+            found[stored.topic].append((stored.log_time, bytes(stored.data)))
     return found
 
 

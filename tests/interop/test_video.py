@@ -16,8 +16,8 @@ import pytest
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as Proto
 from google.protobuf.timestamp_pb2 import Timestamp
 from made_bags import ROS2, SECOND, header, made, ros, write_ros2
+from made_recordings import foreign
 from made_video import PERIOD, clip, decoded
-from mcap.writer import Writer
 
 from dataflow.interop.opening import open_bag
 from dataflow.interop.streams import BagStreams, Played
@@ -33,16 +33,9 @@ START = 5 * SECOND
 
 
 def ffmpeg(number: int, data: bytes, encoding: str) -> Any:
-    return ros(
-        "ffmpeg_image_transport_msgs/FFMPEGPacket",
-        header=header(START + number * PERIOD, "cam"),
-        width=96,
-        height=64,
-        encoding=encoding,
-        pts=number,
-        flags=int(number % 8 == 0),
-        data=np.frombuffer(data, np.uint8),
-    )
+    about = {"width": 96, "height": 64, "encoding": encoding, "pts": number, "flags": int(number % 8 == 0)}
+    at, flat = header(START + number * PERIOD, "cam"), np.frombuffer(data, np.uint8)
+    return ros("ffmpeg_image_transport_msgs/FFMPEGPacket", header=at, data=flat, **about)
 
 
 def foxglove(number: int, data: bytes, encoding: str) -> Any:
@@ -87,31 +80,18 @@ def test_packets_of_ros_bags_decode(make: Any, encoding: str, format_: str, tmp_
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_packets_of_foxglove_files_decode(encoding: str, tmp_path: Path) -> None:
     packets = clip("h264")
-    with (tmp_path / "video.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema(
-            "foxglove.CompressedVideo",
-            "protobuf" if encoding == "protobuf" else "jsonschema",
-            file_descriptor_set(Proto) if encoding == "protobuf" else b"{}",
-        )
-        channel = writer.register_channel("/video", encoding, schema)
-        for k, packet in enumerate(packets):
-            stamp = START + k * PERIOD
-            seconds, rest = divmod(stamp, SECOND)
-            proto = Proto(
-                timestamp=Timestamp(seconds=seconds, nanos=rest), frame_id="cam", format="h264", data=packet
-            ).SerializeToString()
-            text = {
-                "timestamp": {"sec": seconds, "nsec": rest},
-                "frame_id": "cam",
-                "format": "h264",
-                "data": base64.b64encode(packet).decode(),
-            }
-            writer.add_message(
-                channel, stamp + 1, proto if encoding == "protobuf" else json.dumps(text).encode(), stamp + 1
-            )
-        writer.finish()
+    messages = []
+    for k, packet in enumerate(packets):
+        seconds, rest = divmod(START + k * PERIOD, SECOND)
+        if encoding == "protobuf":
+            at = Timestamp(seconds=seconds, nanos=rest)
+            data = Proto(timestamp=at, frame_id="cam", format="h264", data=packet).SerializeToString()
+        else:
+            values = {"timestamp": {"sec": seconds, "nsec": rest}, "frame_id": "cam", "format": "h264"}
+            data = json.dumps(values | {"data": base64.b64encode(packet).decode()}).encode()
+        messages.append((START + k * PERIOD + 1, data))
+    kind = ("protobuf", file_descriptor_set(Proto)) if encoding == "protobuf" else ("jsonschema", b"{}")
+    foreign(tmp_path / "video.mcap", ("/video", encoding, ("foxglove.CompressedVideo", *kind), messages))
     assert all(map(np.array_equal, images_of(tmp_path / "video.mcap"), decoded("h264", packets)))
 
 

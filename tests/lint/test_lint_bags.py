@@ -87,7 +87,7 @@ def test_a_message_that_is_not_json_is_a_finding(tmp_path: Path) -> None:
         for k in range(5):
             sent = {"timestamp": {"sec": k + 1, "nsec": 0}, "frame_id": "map", "pose": place}
             writer.add_message(channel, k * SECOND, b"{" if k == 3 else json.dumps(sent).encode(), 0)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
 
     told = CliRunner().invoke(app, ["lint", str(file), "--json"])
 

@@ -33,9 +33,7 @@ def endpoint(tmp_path: Path) -> str:
     return f"unixsock-stream/{tmp_path / 'meet'}"
 
 
-def test_a_run_goes_on_while_its_machine_is_not_heard_until_it_is_lost(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_continues_while_machine_is_silent_until_lost(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with elsewhere(endpoint, None):
         with answering(endpoint, 1.0):
             found = find_running(None)
@@ -47,7 +45,7 @@ def test_a_run_goes_on_while_its_machine_is_not_heard_until_it_is_lost(
 
 
 @pytest.mark.parametrize("ends", ["another run", "its own end"])
-def test_a_run_is_over_when_its_machine_says_so_or_has_another(endpoint: str, ends: str) -> None:
+def test_run_is_over_when_machine_ends_it_or_has_another(endpoint: str, ends: str) -> None:
     with elsewhere(endpoint, None), ExitStack() as stack:
         with answering(endpoint, 1.0):
             found = find_running(None)
@@ -55,7 +53,7 @@ def test_a_run_is_over_when_its_machine_says_so_or_has_another(endpoint: str, en
 
         deadline = time.monotonic() + 10
         if ends == "its own end":
-            while not attach._elsewhere.get()._over and time.monotonic() < deadline:  # type: ignore[union-attr]
+            while not attach._elsewhere.get()._over and time.monotonic() < deadline:
                 assert still_runs(found)
                 bus.session.put(OVER_KEY, msgpack.packb(1.0))
         while still_runs(found):

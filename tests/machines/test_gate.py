@@ -35,7 +35,7 @@ def gate(passed: dict[str, list[bytes]]) -> Gate:
         said.append(word)
         assert word[2]["fields"]
 
-    return Gate(Inbox(), Fanout([]), pipes, routes, say)  # type: ignore[arg-type]
+    return Gate(Inbox(), Fanout([]), pipes, routes, say)
 
 
 def test_a_machine_sends_nothing_in_the_place_of_another(gate: Gate, passed: dict[str, list[bytes]]) -> None:

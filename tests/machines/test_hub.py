@@ -41,12 +41,12 @@ def test_the_claim_of_an_agent_that_is_gone_before_it_joined_lapses() -> None:
     assert claims.answer("robot", b"1", "", None, LONG + 0.1) == "another"
 
 
-def test_agents_are_given_what_they_were_to_hear_before_the_link_leaves(tmp_path: Path) -> None:
+def test_agents_get_pending_messages_before_the_link_closes(tmp_path: Path) -> None:
     endpoint, listen = (f"unixsock-stream/{tmp_path / name}" for name in ("meet", "tools"))
     routes = Routes([], {}, {}, frozenset(), frozenset()).to_json()
     config = HubConfig("@link", endpoint, None, listen, (), "run", ("robot",), "test", routes, {}, True)
     inbox, taken = Inbox(), list[bytes]()
-    hub = Hub(config, SimpleNamespace(send=lambda kind, **fields: None), inbox, ())  # type: ignore[arg-type]
+    hub = Hub(config, SimpleNamespace(send=lambda kind, **fields: None), inbox, ())
     hub.open()
     with closing(router((), (endpoint,), {})) as bus:
         up, down = (machine_key("robot", "run", way) for way in ("up", "down"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -14,10 +15,9 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from joined_agents import HERE, end, join
+from joined_agents import HERE, end, join, once_it_runs, taken, wait_until
 from link_relay import Relay
 from needed_programs import need
 
@@ -32,7 +32,7 @@ from dataflow.machines.keys import (
     require_serving,
     settings,
 )
-from dataflow.supervision.core.report import RunFailed, Status
+from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
 from dataflow.supervision.supervisor import Supervisor
@@ -93,13 +93,6 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
     """For more than a link may be silent, and for more than Zenoh keeps it (`hub.LEASE`)."""
     port, relay = link
     robot = join("robot", f"tls/127.0.0.1:{relay.port}", tmp_path / "files", "--keys", str(keys / "robot"))
-    stalled = threading.Event()
-
-    def spoil(status: Status) -> None:
-        counts = status.operators["sensor"]
-        if status.phase == "running" and counts.firings > 50 and not stalled.is_set():
-            stalled.set()
-            threading.Thread(target=trouble, daemon=True).start()
 
     def trouble() -> None:
         assert listening(port) == [f"127.0.0.1:{port}"]
@@ -114,15 +107,12 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
         machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
         live=True,
         record=tmp_path / "link.mcap",
-        watch=spoil,
+        watch=once_it_runs(trouble),
     )
 
     said = end(robot)
-    assert stalled.is_set()
-    took = {name: summary["taken"] for name, summary in report.summaries.items()}
-    dropped = sum(number for _, _, number in report.drops.get("sensor", ()))
-    assert took == dict.fromkeys(("here", "there"), 400 - dropped), said
-    assert not dropped
+    assert taken(report) == dict.fromkeys(("here", "there"), 400), said
+    assert "sensor" not in report.drops
     assert not report.restarts
     assert any("the link to machine 'robot' is down" in note for note in report.notes)
     assert any("the link to machine 'robot' is back" in note for note in report.notes)
@@ -144,9 +134,8 @@ def test_a_slow_link_delays_messages_and_gets_no_process_killed(
     )
 
     said = end(robot)
-    took = {name: summary["taken"] for name, summary in report.summaries.items()}
     dropped = sum(number for _, _, number in report.drops.get("sensor", ()))
-    assert took == dict.fromkeys(("here", "there"), 400 - dropped), said
+    assert taken(report) == dict.fromkeys(("here", "there"), 400 - dropped), said
     assert not report.restarts
     assert not any("no longer waited for" in note for note in report.notes)
 
@@ -156,24 +145,18 @@ def test_an_agent_that_gave_the_run_up_ends_it(keys: Path, link: tuple[int, Rela
     port, relay = link
     at = f"tls/127.0.0.1:{relay.port}"
     robot = join("robot", at, tmp_path / "files", "--keys", str(keys / "robot"), "--timeout", "2")
-    stalled = threading.Event()
 
     def stall() -> None:
         relay.stalled = True
         time.sleep(4.0)  # more than the agent is patient for
         relay.stalled = False
 
-    def spoil(status: Status) -> None:
-        if status.phase == "running" and status.operators["sensor"].firings > 50 and not stalled.is_set():
-            stalled.set()
-            threading.Thread(target=stall, daemon=True).start()
-
     with pytest.raises(RunFailed, match=r"machine 'robot' has left the run: .*; its operators are gone"):
         run(
             load_text(GRAPH.replace("steps: 400", "steps: 1000000")),
             machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
             live=True,
-            watch=spoil,
+            watch=once_it_runs(stall),
         )
 
     assert "the supervisor was not heard for 2 s" in end(robot)
@@ -190,20 +173,22 @@ def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Pat
     end(stranger)
 
 
-def test_an_endpoint_without_keys_is_refused_beyond_a_socket_of_this_user(keys: Path) -> None:
-    with pytest.raises(NetworkError, match=r"'tcp/127\.0\.0\.1:7447' needs keys: make them with `dataflow keys new"):
-        settings(None, "tcp/127.0.0.1:7447")
-    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
-        settings(keys / "laptop", "tcp/0.0.0.0:7447")
-    with pytest.raises(NetworkError, match=r"no certificate\.pem, key\.pem"):
-        settings(keys / "authority", "tls/127.0.0.1:7447")
+ADDRESSED = r"expected tls/<address>:<port>"
+
+
+@pytest.mark.parametrize(
+    ("held", "endpoint", "reason"),
+    [
+        (None, "tcp/127.0.0.1:7447", r"'tcp/127\.0\.0\.1:7447' needs keys: make them with `dataflow keys new"),
+        ("authority", "tls/127.0.0.1:7447", r"no certificate\.pem, key\.pem"),
+        ("laptop", "tcp/0.0.0.0:7447", ADDRESSED),
+        *(("tools", at, ADDRESSED) for at in ("tls/10.0.0.2", "tls/:7447", "tls/10.0.0.2:port", "tcp/10.0.0.2:7447")),
+    ],
+)
+def test_endpoint_without_keys_or_port_is_refused(keys: Path, held: str | None, endpoint: str, reason: str) -> None:
+    with pytest.raises(NetworkError, match=reason):
+        settings(held and keys / held, endpoint)
     assert settings(None, "unixsock-stream//run/meet") == {}
-
-
-@pytest.mark.parametrize("endpoint", ["tls/10.0.0.2", "tls/:7447", "tls/10.0.0.2:port", "tcp/10.0.0.2:7447"])
-def test_an_endpoint_without_a_port_is_refused_where_it_is_connected_to(keys: Path, endpoint: str) -> None:
-    with pytest.raises(NetworkError, match=r"expected tls/<address>:<port>"):
-        settings(keys / "tools", endpoint)
 
 
 def test_keys_are_their_owners_alone_and_are_never_replaced(keys: Path) -> None:
@@ -262,48 +247,53 @@ def test_keys_that_could_not_be_made_leave_nothing_in_the_way(keys: Path, tmp_pa
     }
 
 
+ASKED = {
+    "echo": ("tools", "echo there/y -n 3 --json"),
+    "echo here": ("tools", "echo here/y -n 3 --json"),
+    "top": ("tools", "top --json"),
+    "hz": ("tools", "hz there/y --seconds 1 --json"),
+    "health": ("tools", "health --over 0.3 --json"),
+    "reload": ("laptop", "reload there --json"),
+    "refused": ("tools", "reload there --timeout 1"),
+    "playback": ("tools", "playback pause"),
+    "trigger": ("tools", "trigger"),
+    "pub": ("tools", """pub given '{"linear": [1, 0, 0], "angular": [0, 0, 0], "frame": "base"}'"""),
+    "set": ("tools", "param set there.gain 7"),
+    "record": ("tools", "record there/y -o part.mcap --seconds 0.5"),
+    "stranger": ("stranger", "echo there/y -n 1"),
+}
+"""Commands of tools on another machine: whose keys they have, and what is typed."""
+
+
 @pytest.mark.long
 def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(keys: Path, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
     robot = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / "robot"))
-    found: dict[str, Any] = {}
+    done: dict[str, int] = {}
+    out: dict[str, str] = {}
+    err: dict[str, str] = {}
+    views: list[subprocess.Popen[str]] = []
 
-    def tool(*words: str, held: str = "tools") -> subprocess.CompletedProcess[str]:
-        started = started_tool(*words, held=held)
-        said, complaint = started.communicate(timeout=60)
-        return subprocess.CompletedProcess(words, started.returncode, said, complaint)
-
-    def started_tool(*words: str, held: str = "tools") -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "dataflow.cli.main", *words, "--connect", endpoint, "--keys", str(keys / held)]
+    def begun(words: str, held: str = "tools") -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "dataflow.cli.main", *shlex.split(words)]
+        command += ["--connect", endpoint, "--keys", str(keys / held)]
         env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(HERE)}
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, text=True, env=env, cwd=tmp_path, **pipes)
 
     def follow(supervisor: Supervisor) -> None:
         try:
-            while supervisor.status.phase == "starting":
-                time.sleep(0.05)
-            viewer = tmp_path / "view.rrd"
-            found["view"] = started_tool("view", "--to", str(viewer))
-            foxglove = started_tool("foxglove", "--port", "0")
-            found["echo"] = tool("echo", "there/y", "-n", "3", "--json")
-            found["echo here"] = tool("echo", "here/y", "-n", "3", "--json")
-            found["top"] = tool("top", "--json")
-            found["hz"] = tool("hz", "there/y", "--seconds", "1", "--json")
-            found["health"] = tool("health", "--over", "0.3", "--json")
-            found["reload"] = tool("reload", "there", "--json", held="laptop")
-            found["refused"] = tool("reload", "there", "--timeout", "1")
-            for word in ("playback", "trigger"):
-                found[word] = tool(*((word, "pause") if word == "playback" else (word,)))
-            found["pub"] = tool("pub", "given", '{"linear": [1, 0, 0], "angular": [0, 0, 0], "frame": "base"}')
-            assert foxglove.stderr is not None
-            found["foxglove"] = foxglove.stderr.readline()
+            wait_until(lambda: supervisor.status.phase != "starting")
+            views.append(begun("view --to view.rrd"))
+            foxglove = begun("foxglove --port 0")
+            for name, (held, words) in ASKED.items():
+                tool = begun(words, held)
+                out[name], err[name] = tool.communicate(timeout=60)
+                done[name] = tool.returncode
+            out["foxglove"] = foxglove.stderr.readline()
             foxglove.send_signal(signal.SIGINT)
             foxglove.communicate(timeout=60)
-            found["set"] = tool("param", "set", "there.gain", "7")
-            found["record"] = tool("record", "there/y", "-o", str(tmp_path / "part.mcap"), "--seconds", "0.5")
-            found["stranger"] = tool("echo", "there/y", "-n", "1", held="stranger")
-            while not viewer.exists() or not viewer.stat().st_size:
-                time.sleep(0.05)
+            wait_until(lambda: (tmp_path / "view.rrd").exists() and (tmp_path / "view.rrd").stat().st_size > 0)
         finally:
             supervisor.stop()
 
@@ -314,29 +304,24 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
         yield
         following.join()
 
-    meeting = Meeting(endpoint, keys / "laptop")
     graph = GRAPH.replace("steps: 400", "steps: 1000000") + '  given: {use: "dataflow.remote:Twist"}\n'
-    run(load_text(graph), machines=meeting, live=True, controls=controls)
+    run(load_text(graph), machines=Meeting(endpoint, keys / "laptop"), live=True, controls=controls)
 
     end(robot)
-    assert found["view"].communicate(timeout=60) is not None
-    assert found["view"].returncode == 0
-    assert "ws://" in found["foxglove"]
-    assert len(found["echo"].stdout.splitlines()) == 3, found["echo"]
-    assert len(found["echo here"].stdout.splitlines()) == 3, found["echo here"]
-    top = json.loads(found["top"].stdout)
+    for view in views:
+        _, err["view"] = view.communicate(timeout=60)
+        done["view"] = view.returncode
+    refused = {"refused", "playback", "trigger", "stranger"}
+    assert {name for name, code in done.items() if code} == refused, err
+    assert "ws://" in out["foxglove"]
+    assert len(out["echo"].splitlines()) == len(out["echo here"].splitlines()) == 3
+    top = json.loads(out["top"])
     assert {row["operator"]: row["state"] for row in top["operators"]}["there"] == "running"
-    robot_state = top["machines"]["robot"]
-    assert robot_state["up"]
-    assert abs(robot_state["offset"]) <= robot_state["delay"] / 2  # it is this machine's clock
-    assert json.loads(found["hz"].stdout), found["hz"]
-    assert "live" in found["playback"].stderr
-    assert "flight recorder" in found["trigger"].stderr
-    assert found["pub"].returncode == 0, found["pub"]
-    assert json.loads(found["health"].stdout)["reasons"] == [], found["health"]
-    assert json.loads(found["reload"].stdout)["operator"] == "there", found["reload"]
-    assert "there is not reloaded: these are keys of tools" in found["refused"].stderr
-    assert found["set"].returncode == 0, found["set"]
-    assert found["record"].returncode == 0, found["record"]
-    assert found["stranger"].returncode != 0
-    assert "these keys are not let in" in found["stranger"].stderr
+    assert top["machines"]["robot"]["up"]
+    assert abs(top["machines"]["robot"]["offset"]) <= top["machines"]["robot"]["delay"] / 2  # it is this one's clock
+    assert json.loads(out["hz"])
+    assert json.loads(out["health"])["reasons"] == []
+    assert json.loads(out["reload"])["operator"] == "there"
+    for name, reason in (("playback", "live"), ("trigger", "flight recorder"), ("refused", "these are keys of tools")):
+        assert reason in err[name]
+    assert "these keys are not let in" in err["stranger"]

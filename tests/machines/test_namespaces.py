@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from joined_agents import HERE, end
+from joined_agents import HERE, end, once_it_runs, taken
 from needed_programs import need
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import issue, new_authority
-from dataflow.supervision.core.report import Status
 from dataflow.supervision.plan import Meeting
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
@@ -77,7 +75,6 @@ def test_a_cable_that_is_pulled_loses_nothing_and_only_the_asked_port_listens(
         ["ip", "netns", "exec", SPACE, "env", f"PYTHONPATH={HERE}", *command], stdout=subprocess.PIPE, text=True
     )
     listening: dict[str, str] = {}
-    pulled = threading.Event()
 
     def pull() -> None:
         there = ["ip", "netns", "exec", SPACE, "ss", "-Hltn"]
@@ -88,26 +85,18 @@ def test_a_cable_that_is_pulled_loses_nothing_and_only_the_asked_port_listens(
         time.sleep(seconds)
         ip("link", "set", HERE_SIDE, "up")
 
-    def watch(status: Status) -> None:
-        if status.phase == "running" and status.operators["sensor"].firings > 50 and not pulled.is_set():
-            pulled.set()
-            threading.Thread(target=pull, daemon=True).start()
-
-    meeting = Meeting(endpoint, tmp_path / "laptop")
     report = run(
         load_text(GRAPH.replace("STEPS", str(steps))),
-        machines=meeting,
+        machines=Meeting(endpoint, tmp_path / "laptop"),
         live=True,
         record=tmp_path / "cable.mcap",
-        watch=watch,
+        watch=once_it_runs(pull),
     )
 
     said = end(robot)
     assert listening["there"] == ""
     assert [line.split()[3] for line in listening["here"].splitlines()] == [f"{ADDRESS}:{PORT}"]
-    dropped = sum(number for _, _, number in report.drops.get("sensor", ()))
-    took = {name: summary["taken"] for name, summary in report.summaries.items()}
-    assert took == dict.fromkeys(("here", "there"), steps - dropped), said
-    assert not dropped
+    assert taken(report) == dict.fromkeys(("here", "there"), steps), said
+    assert "sensor" not in report.drops
     assert any("the link to machine 'robot' is back" in note for note in report.notes)
     assert verify(tmp_path / "cable.mcap", jobs=1).identical

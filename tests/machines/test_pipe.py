@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -42,11 +42,23 @@ def link(monkeypatch: pytest.MonkeyPatch) -> Link:
     return Link()
 
 
-def ends(link: Any, taken: list[bytes], *, bounded: bool = False) -> tuple[Pipe, Pipe]:
-    return (
-        Pipe(link, "there", "here", lambda frame: None, bounded=bounded),
-        Pipe(link, "here", "there", taken.append, bounded=False),
-    )
+Ends = Callable[..., Pipe]
+
+
+@pytest.fixture
+def ends(link: Link) -> Iterator[Ends]:
+    """Makes both ends of a pipe, of which the second gives what it takes to a list; returns the first."""
+    made: list[Pipe] = []
+
+    def both(taken: list[bytes], *, bounded: bool = False) -> Pipe:
+        bus: Any = link
+        made.append(Pipe(bus, "there", "here", lambda frame: None, bounded=bounded))
+        made.append(Pipe(bus, "here", "there", taken.append, bounded=False))
+        return made[0]
+
+    yield both
+    for pipe in made:
+        pipe.close()
 
 
 def emptied(pipe: Pipe) -> bool:
@@ -56,11 +68,11 @@ def emptied(pipe: Pipe) -> bool:
     return pipe.idle
 
 
-def test_frames_of_a_link_that_loses_arrive_once_and_in_order(link: Link) -> None:
+def test_frames_of_a_link_that_loses_arrive_once_and_in_order(link: Link, ends: Ends) -> None:
     taken: list[bytes] = []
     passed = iter(range(1_000_000))
     link.loses = lambda payload: next(passed) % 7 in (2, 3)  # single ones, pairs, and those that are sent again
-    a, b = ends(link, taken)
+    a = ends(taken)
 
     for k in range(300):
         a.send(b"%d" % k)
@@ -68,33 +80,29 @@ def test_frames_of_a_link_that_loses_arrive_once_and_in_order(link: Link) -> Non
     assert emptied(a)
     assert taken == [b"%d" % k for k in range(300)]
     assert a.dropped == 0
-    a.close()
-    b.close()
 
 
-def test_the_last_frame_is_missed_by_the_mark_that_follows_it(link: Link) -> None:
+def test_loss_of_last_frame_is_detected_by_the_mark(link: Link, ends: Ends) -> None:
     taken: list[bytes] = []
     lost: list[bytes] = []
-    link.loses = lambda payload: payload.endswith(b"last") and not lost and not lost.append(payload)  # type: ignore[func-returns-value]
-    a, b = ends(link, taken)
+    link.loses = lambda payload: payload.endswith(b"last") and not lost and not lost.append(payload)
+    a = ends(taken)
 
     a.send(b"last")
 
     assert emptied(a)
     assert taken == [b"last"]
     assert lost
-    a.close()
-    b.close()
 
 
 def test_what_waits_for_a_dead_link_is_bounded_and_what_must_not_be_missed_is_kept(
-    link: Link, monkeypatch: pytest.MonkeyPatch
+    link: Link, ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipes, "MOST_WAITING", 1000)
     monkeypatch.setattr(pipes, "IN_FLIGHT", 1)
     taken: list[bytes] = []
     link.loses = lambda payload: True
-    a, b = ends(link, taken, bounded=True)
+    a = ends(taken, bounded=True)
     a.send(b"first")
     time.sleep(0.05)  # it is on its way
 
@@ -107,17 +115,15 @@ def test_what_waits_for_a_dead_link_is_bounded_and_what_must_not_be_missed_is_ke
     assert {*range(0, 100, 10)} <= set(kept)  # beyond the bound alone, since they may not be dropped
     assert kept == sorted(kept)
     assert a.dropped == 100 - len(kept) > 80
-    a.close()
-    b.close()
 
 
 @pytest.mark.parametrize("size", [0, 1, pipes.PIECE, pipes.PIECE + 1, 5 * pipes.PIECE, 1_000_003])
-def test_a_long_frame_goes_in_pieces_and_comes_whole(link: Link, size: int) -> None:
+def test_a_long_frame_goes_in_pieces_and_comes_whole(link: Link, ends: Ends, size: int) -> None:
     taken: list[bytes] = []
     sizes: list[int] = []
     passed = iter(range(1_000_000))
-    link.loses = lambda payload: sizes.append(len(payload)) or next(passed) % 5 == 2  # type: ignore[func-returns-value]
-    a, b = ends(link, taken)
+    link.loses = lambda payload: sizes.append(len(payload)) or next(passed) % 5 == 2
+    a = ends(taken)
     frames = [b"before", bytes(range(256)) * (size // 256) + b"e" * (size % 256), b"behind"]
 
     for frame in frames:
@@ -126,8 +132,6 @@ def test_a_long_frame_goes_in_pieces_and_comes_whole(link: Link, size: int) -> N
     assert emptied(a)
     assert taken == frames
     assert max(sizes) <= pipes.PIECE + 100
-    a.close()
-    b.close()
 
 
 class SlowLink:
@@ -202,7 +206,7 @@ def test_exchanges_from_before_a_clock_was_set_are_forgotten() -> None:
 
 
 def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
-    link: Link, monkeypatch: pytest.MonkeyPatch
+    link: Link, ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipes, "MOST_WAITING", 10_000)
     looks: list[int] = []
@@ -214,7 +218,7 @@ def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
 
     monkeypatch.setattr(Pipe, "_drop_oldest", look)
     link.loses = lambda payload: True
-    a, b = ends(link, [], bounded=True)
+    a = ends([], bounded=True)
 
     for _ in range(1000):
         a.send(b"x" * 100, droppable=True)
@@ -225,14 +229,11 @@ def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
         a.send(b"x" * 100)
     assert len(looks) <= 101
 
-    a.close()
-    b.close()
 
-
-def test_a_word_with_a_beat_overtakes_the_frames(link: Link) -> None:
+def test_message_sent_with_beat_overtakes_frames(link: Link, ends: Ends) -> None:
     taken: list[bytes] = []
     link.loses = lambda payload: True
-    a, b = ends(link, taken)
+    a = ends(taken)
     a.send(b"frame")
 
     a.send_with_beat(b"word")
@@ -241,5 +242,3 @@ def test_a_word_with_a_beat_overtakes_the_frames(link: Link) -> None:
     link.loses = lambda payload: False
     assert emptied(a)
     assert taken == [b"word", b"frame"]
-    a.close()
-    b.close()

@@ -15,9 +15,9 @@ from dataflow.graph import load_text
 from dataflow.machines import files
 from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
+from dataflow.supervision.links import pairs_of
 from dataflow.supervision.plan import LINK, Meeting, RunPlan, process_plans
 from dataflow.supervision.remote import PIECES_ON_THE_WAY, Remote
-from dataflow.supervision.rings import pairs_of
 
 sys.path.append(str(HERE))
 GRAPH = """\
@@ -62,7 +62,7 @@ def met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Orders, list[e
     endpoints = dict.fromkeys([*processes, LINK], "none")
     pairs = pairs_of(plan.graph, processes)
     remote = Remote(
-        plan, plan.machines, processes, pairs, endpoints, orders, fed.append, lambda *_: None, lambda _: None  # type: ignore[arg-type]
+        plan, plan.machines, processes, pairs, endpoints, orders, fed.append, lambda *_: None, lambda _: None
     )  # fmt: skip
     for machine in ("robot", "arm"):
         remote.take(events.Said(LINK, "link", {"machine": machine, "up": True}))
@@ -98,7 +98,7 @@ def test_a_file_that_was_not_offered_is_sent_to_no_machine(met: tuple[Orders, li
     assert orders.kinds("robot")["file"] == 0
 
 
-def test_a_machine_is_believed_about_its_own_processes_alone(met: tuple[Orders, list[events.Event], Says]) -> None:
+def test_machine_reports_only_its_own_processes(met: tuple[Orders, list[events.Event], Says]) -> None:
     _, fed, says = met
 
     says("robot", "died", "right", code=1)

@@ -8,13 +8,13 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from joined_agents import HERE, Robot, end, join
+from joined_agents import HERE, Robot, end, join, taken, wait_until
 
 from dataflow.graph import load_text
 from dataflow.recording import Recording
@@ -39,13 +39,12 @@ operators:
 """
 
 
+PLAIN = GRAPH.replace("SIZE", "1").replace(", MORE", "")
+
+
 def two(robot: Robot, text: str = GRAPH, **options: Any) -> RunReport:
     graph = load_text(text.replace("SIZE", "1").replace(", MORE", ""))
     return run(graph, machines=Meeting(robot.endpoint), **options)
-
-
-def taken(report: RunReport) -> Mapping[str, Any]:
-    return {name: summary["taken"] for name, summary in report.summaries.items() if "taken" in summary}
 
 
 @pytest.mark.parametrize("live", [pytest.param(False, marks=pytest.mark.long), True])
@@ -157,12 +156,11 @@ def test_a_machine_that_lacks_a_module_is_named_let_go_and_takes_the_next_run(
     monkeypatch.syspath_prepend(tmp_path / "here")
     endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
     agent = join("robot", endpoint, tmp_path / "files", code=tmp_path / "there")
-    text = GRAPH.replace("SIZE", "1").replace(", MORE", "")
-    other = text.replace('there: {use: "machine_operators:Scale"', 'there: {use: "own_scale:OwnScale"')
+    other = PLAIN.replace('there: {use: "machine_operators:Scale"', 'there: {use: "own_scale:OwnScale"')
 
     with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: scales/gains\.py is missing"):
         run(load_text(other), machines=Meeting(endpoint))
-    report = run(load_text(text), machines=Meeting(endpoint))
+    report = run(load_text(PLAIN), machines=Meeting(endpoint))
     with pytest.raises(RunFailed, match="is missing"):
         run(load_text(other), machines=Meeting(endpoint))
 
@@ -195,12 +193,12 @@ def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_t
 def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tmp_path: Path) -> None:
     meeting = Meeting(f"unixsock-stream/{tmp_path / 'meet'}")
     with pytest.raises(RunFailed, match=r"machine 'robot' did not join\. On each: dataflow join NAME --connect unix"):
-        run(load_text(GRAPH.replace("SIZE", "1").replace(", MORE", "")), machines=meeting, start_timeout=0.2)
+        run(load_text(PLAIN), machines=meeting, start_timeout=0.2)
 
 
 @pytest.mark.long
 def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
-    graph = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
+    graph = load_text(PLAIN)
     with pytest.raises(RunFailed, match=r"machine robot: say where machines join .* or run all of it here"):
         run(graph)
     assert run(graph, machines=None).summaries["there"]["taken"] == 120
@@ -211,18 +209,17 @@ def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_t
     endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
     agent = join("robot", endpoint, tmp_path / "files", "--timeout", "2")
     graph = tmp_path / "two.yaml"
-    graph.write_text(GRAPH.replace("SIZE", "1").replace(", MORE", "").replace("steps: 120", "steps: 1000000"))
+    graph.write_text(PLAIN.replace("steps: 120", "steps: 1000000"))
     command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--live", "--listen", endpoint, "--quiet"]
     supervisor = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(HERE)})
     there = psutil.Process(agent.pid)
-    await_(lambda: any(child.name() == "sensor" for child in there.children(recursive=True)))
+    wait_until(lambda: any(child.name() == "sensor" for child in there.children(recursive=True)))
 
     supervisor.kill()
 
     supervisor.wait(timeout=20)
-    await_(lambda: not there.children(recursive=True))
-    short = load_text(GRAPH.replace("SIZE", "1").replace(", MORE", ""))
-    assert run(short, machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
+    wait_until(lambda: not there.children(recursive=True))
+    assert run(load_text(PLAIN), machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
     assert "was not heard for 2 s" in end(agent)
 
 
@@ -234,16 +231,8 @@ def settled(count: Callable[[], int]) -> int:
         seen.append(count())
         return len(seen) > 10 and len(set(seen[-10:])) == 1
 
-    await_(still)
+    wait_until(still)
     return seen[-1]
-
-
-def await_(condition: Callable[[], bool], within: float = 60.0) -> None:
-    """Waits (bounded) until a condition holds."""
-    deadline = time.monotonic() + within
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.mark.long

@@ -9,106 +9,58 @@ import pytest
 from example_messages import example
 from numpy.typing import NDArray
 
-from dataflow.messages import (
-    Activity,
-    Boxes3D,
-    CameraInfo,
-    Clusters,
-    CompressedDepth,
-    CompressedImage,
-    CompressedVideo,
-    DepthImage,
-    Detections2D,
-    Diagnostics,
-    FeatureVector,
-    Image,
-    Imu,
-    JointState,
-    LandmarkSightings,
-    LaserScan,
-    Mesh,
-    Message,
-    MessageError,
-    NavSatFix,
-    OccupancyGrid,
-    Odometry,
-    ParticleSet,
-    Path,
-    Planes,
-    PointCloud,
-    Pose,
-    Rooms,
-    SceneGraph,
-    SegmentationMap,
-    Tracks,
-    Transforms,
-    WheelTicks,
-)
+from dataflow import messages as m
+from dataflow.messages import LaserScan, Message, MessageError
 from dataflow.messages.base import ArrayField
 
 UNIT = [0.0, 0.0, 0.0, 1.0]
 NAN = float("nan")
 
-detections = Detections2D(
-    stamp=0,
-    frame="cam",
-    width=640,
-    height=480,
-    class_names=("cat", "dog"),
-    boxes=[[0, 0, 10, 10], [5, 5, 20, 30]],
-    scores=[0.5, 1.0],
-    class_ids=[0, 1],
-)
-boxes = Boxes3D(
-    stamp=0,
-    frame="map",
-    class_names=("car",),
-    centers=[[0, 0, 0]],
-    sizes=[[1, 1, 1]],
-    orientations=[UNIT],
-    scores=[1],
-    class_ids=[0],
-)
-tracks = Tracks(
-    stamp=0,
-    frame="map",
-    ids=[4, 9],
-    states=[1, 2],
-    scores=[1, 0.5],
-    class_ids=[0, 7],
-    ages=[0, 1],
-    unseen=[0, 0.1],
-    positions=np.zeros((2, 3)),
-)
-scene = SceneGraph(
-    stamp=0,
-    frame="map",
-    class_names=("cup", "table"),
-    labels=("my cup", "the table"),
-    predicates=("on",),
-    ids=[1, 2],
-    class_ids=[0, 1],
-    positions=np.zeros((2, 3)),
-    sizes=np.ones((2, 3)),
-    subjects=[0],
-    objects=[1],
-)
-activity = Activity(stamp=0, class_names=("walk", "sit"), subjects=[3], class_ids=[0], scores=[0.4])
-segments = SegmentationMap(stamp=0, frame="cam", class_names=("a", "b"), classes=np.zeros((2, 2), np.uint8))
-camera = CameraInfo.from_intrinsics(stamp=0, frame="cam", width=640, height=480, fx=500, fy=500, cx=320, cy=240)
-sightings = LandmarkSightings(stamp=0, frame="base", ids=[-1, 5], ranges=[1, 2], bearings=[0, 0.1])
-grid = OccupancyGrid(stamp=0, frame="map", resolution=0.05, cells=np.zeros((2, 3), np.int8), position=[0, 0, 0])
-rooms = Rooms(
+detections = m.Detections2D(
+    stamp=0, frame="cam", width=640, height=480, class_names=("cat", "dog"),
+    boxes=[[0, 0, 10, 10], [5, 5, 20, 30]], scores=[0.5, 1.0], class_ids=[0, 1],
+)  # fmt: skip
+boxes = m.Boxes3D(
+    stamp=0, frame="map", class_names=("car",), centers=[[0, 0, 0]], sizes=[[1, 1, 1]], orientations=[UNIT],
+    scores=[1], class_ids=[0],
+)  # fmt: skip
+tracks = m.Tracks(
+    stamp=0, frame="map", ids=[4, 9], states=[1, 2], scores=[1, 0.5], class_ids=[0, 7], ages=[0, 1],
+    unseen=[0, 0.1], positions=np.zeros((2, 3)),
+)  # fmt: skip
+scene = m.SceneGraph(
+    stamp=0, frame="map", class_names=("cup", "table"), labels=("my cup", "the table"), predicates=("on",),
+    ids=[1, 2], class_ids=[0, 1], positions=np.zeros((2, 3)), sizes=np.ones((2, 3)), subjects=[0], objects=[1],
+)  # fmt: skip
+activity = m.Activity(stamp=0, class_names=("walk", "sit"), subjects=[3], class_ids=[0], scores=[0.4])
+segments = m.SegmentationMap(stamp=0, frame="cam", class_names=("a", "b"), classes=np.zeros((2, 2), np.uint8))
+camera = m.CameraInfo.from_intrinsics(stamp=0, frame="cam", width=640, height=480, fx=500, fy=500, cx=320, cy=240)
+sightings = m.LandmarkSightings(stamp=0, frame="base", ids=[-1, 5], ranges=[1, 2], bearings=[0, 0.1])
+grid = m.OccupancyGrid(stamp=0, frame="map", resolution=0.05, cells=np.zeros((2, 3), np.int8), position=[0, 0, 0])
+rooms = m.Rooms(
     stamp=0, frame="map", resolution=0.05, cells=np.zeros((2, 3), np.int32), position=[0, 0, 0], ids=[1], areas=[0.1],
     centers=[[0, 0, 0]], doors=np.zeros((0, 2), np.int32), door_positions=np.zeros((0, 3)), door_widths=[],
 )  # fmt: skip
-planes = Planes(stamp=0, frame="map", coefficients=[[0, 0, 1, -0.7]])
-fix = NavSatFix(stamp=0, frame="gps", latitude=48.1, longitude=11.6, altitude=520.0)
-tf = Transforms(
+planes = m.Planes(stamp=0, frame="map", coefficients=[[0, 0, 1, -0.7]])
+fix = m.NavSatFix(stamp=0, frame="gps", latitude=48.1, longitude=11.6, altitude=520.0)
+tf = m.Transforms(
     stamp=0, frames=("map", "odom"), child_frames=("odom", "base"), translations=np.zeros((2, 3)), rotations=[UNIT] * 2
 )
-status = Diagnostics(stamp=0, names=("lidar",), messages=("hot",), keys=("t",), values=("81",), levels=[1], owners=[0])
-pose = Pose(stamp=0, frame="map", position=[0, 0, 0], orientation=UNIT)
+status = m.Diagnostics(
+    stamp=0, names=("lidar",), messages=("hot",), keys=("t",), values=("81",), levels=[1], owners=[0]
+)
+pose = m.Pose(stamp=0, frame="map", position=[0, 0, 0], orientation=UNIT)
+picture, video = example(m.CompressedImage, 0), example(m.CompressedVideo, 0)
+packed = example(m.CompressedDepth, 0)
+wheels = m.WheelTicks(stamp=0, names=("l", "r"), ticks=[1, 2])
+joints = m.JointState(stamp=0, names=("a", "b"))
+particles = m.ParticleSet(stamp=0, frame="map", poses=[[0, 0, 0]], weights=[1])
+scan = LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1])
+path = m.Path(stamp=0, frame="map", positions=np.zeros((3, 3)))
+mesh = m.Mesh(stamp=0, frame="map", vertices=np.zeros((3, 3)), triangles=np.zeros((0, 3), np.uint32))
+clusters = m.Clusters(stamp=0, frame="map", labels=[0, -1], centroids=[[0, 0, 0]])
+image = m.Image(stamp=0, frame="c", data=np.zeros((2, 2), np.uint8))
+depth = m.DepthImage(stamp=0, frame="c", data=np.zeros((2, 2)))
 png8 = np.frombuffer(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + b"\0\0\0\1" * 2 + b"\x08\0\0\0\0", np.uint8)
 
 REFUSED: list[tuple[Message, dict[str, Any], str]] = [
@@ -120,7 +72,7 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (
         detections,
         {"boxes": [[0, 0, 1, 1], [9, 0, 1, 1]]},
-        r"Detections2D\.boxes\[1\] must be \(x1, y1, x2, y2\) with x1 ≤ x2 and y1 ≤ y2, got \[9\.0, 0\.0, 1\.0, 1\.0\]",
+        r"boxes\[1\] must be \(x1, .* x1 ≤ x2 and y1 ≤ y2, got \[9\.0, 0",
     ),
     (detections, {"boxes": [[0, 5, 1, 1], [0, 0, 1, 1]]}, r"Detections2D\.boxes\[0\]"),
     (detections, {"boxes": [[NAN] * 4, [0, 0, 1, 1]]}, r"Detections2D\.boxes\[0\]"),
@@ -130,13 +82,13 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (
         detections,
         {"masks": np.zeros((2, 480, 79), np.uint8)},
-        r"Detections2D\.masks must have shape \(N, 480, 80\), the bits of 640x480 pixels, got \(2, 480, 79\)",
+        r"have shape \(N, 480, 80\), .* 640x480 pixels, got \(2, 480",
     ),
     (detections, {"masks": np.zeros((1, 480, 80), np.uint8)}, r"masks has N=1, but boxes has N=2"),
     (
         detections,
         {"width": 15, "height": 1, "masks": np.full((2, 1, 2), 255, np.uint8)},
-        r"Detections2D\.masks must be 0 in the 1 bits beyond column 14",
+        r"0 in the 1 bits beyond column 14",
     ),
     (boxes, {"orientations": [[0, 0, 0, 1.01]]}, r"Boxes3D\.orientations\[0\] must be a unit quaternion"),
     (boxes, {"orientations": [[NAN, 0, 0, 1]]}, r"Boxes3D\.orientations\[0\]"),
@@ -178,11 +130,7 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (segments, {"classes": np.full((2, 2), 2, np.uint8)}, r"must index class_names, which has 2 .* got 2 in 4 pixels"),
     (segments, {"classes": np.full((2, 2), 9, np.uint8), "void": 255}, r"or be void \(255\), got 9 in 4 pixels"),
     (segments, {"instances": np.zeros((2, 3), np.int32)}, r"SegmentationMap\.instances has W=3, but classes has W=2"),
-    (
-        segments,
-        {"confidence": np.full((2, 2), 1.5)},
-        r"SegmentationMap\.confidence\[0, 0\] must lie in \[0, 1\] or be NaN",
-    ),
+    (segments, {"confidence": np.full((2, 2), 1.5)}, r"confidence\[0, 0\] must lie in \[0, 1\] or be NaN"),
     (segments, {"classes": np.zeros((0, 2), np.uint8)}, r"SegmentationMap\.classes must hold at least one element"),
     (camera, {"K": np.eye(3) * -1}, r"CameraInfo\.K must have focal lengths above zero"),
     (camera, {"K": np.ones((3, 3))}, r"CameraInfo\.K must have \[0, 0, 1\] as its last row"),
@@ -213,21 +161,9 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (planes, {"extents": [[1, 1]]}, r"Planes\.extents is given without centers, orientations"),
     (planes, {"hulls": np.zeros((3, 3))}, r"Planes\.hulls is given without hull_counts"),
     (planes, {"hulls": np.zeros((3, 3)), "hull_counts": [4]}, r"Planes\.hull_counts\[0\] must lie in \[0, 3\]"),
-    (
-        planes,
-        {"hulls": np.zeros((3, 3)), "hull_counts": [2]},
-        r"hull_counts must add up to the 3 corners of hulls, got 2",
-    ),
-    (
-        planes,
-        {"extents": [[1, -1]], "centers": [[0, 0, 0]], "orientations": [UNIT]},
-        r"Planes\.extents\[0, 1\] must lie in",
-    ),
-    (
-        planes,
-        {"extents": [[1, 1]], "centers": [[0, 0, 0]], "orientations": [[0, 0, 0, 0]]},
-        r"Planes\.orientations\[0\]",
-    ),
+    (planes, {"hulls": np.zeros((3, 3)), "hull_counts": [2]}, r"must add up to the 3 corners of hulls, got 2"),
+    (planes, {"extents": [[1, -1]], "centers": [[0, 0, 0]], "orientations": [UNIT]}, r"extents\[0, 1\] must lie"),
+    (planes, {"extents": [[1, 1]], "centers": [[0, 0, 0]], "orientations": [[0] * 4]}, r"orientations\[0\]"),
     (fix, {"latitude": 90.5}, r"NavSatFix\.latitude must lie in \[-90, 90\], got 90\.5"),
     (fix, {"longitude": 181.0}, r"NavSatFix\.longitude must lie in \[-180, 180\]"),
     (fix, {"latitude": NAN}, r"NavSatFix\.latitude must lie in \[-90, 90\], got nan"),
@@ -245,102 +181,36 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (status, {"owners": None}, r"Diagnostics\.keys has 1 entries, but owners has 0"),
     (status, {"values": ()}, r"Diagnostics\.values has 0 entries"),
     (pose, {"orientation": [0, 0, 0, 0.9]}, r"Pose\.orientation must be a unit quaternion \(x, y, z, w\), got \[0\.0"),
-    (example(Odometry, 0), {"orientation": [0, 0, 0, 2]}, r"Odometry\.orientation"),
-    (example(Imu, 0), {"orientation": [0, 0, 0, 2]}, r"Imu\.orientation"),
-    (
-        Path(stamp=0, frame="map", positions=np.zeros((3, 3))),
-        {"stamps": [1, 5, 5]},
-        r"Path\.stamps must strictly increase, got 5 then 5 at index 2",
-    ),
-    (
-        Path(stamp=0, frame="map", positions=np.zeros((1, 3))),
-        {"orientations": [[1, 1, 1, 1]]},
-        r"Path\.orientations\[0\]",
-    ),
-    (
-        Mesh(stamp=0, frame="map", vertices=np.zeros((3, 3)), triangles=np.zeros((0, 3), np.uint32)),
-        {"triangles": [[0, 1, 3]]},
-        r"Mesh\.triangles\[0, 2\] must index the 3 vertices, got 3",
-    ),
-    (
-        Clusters(stamp=0, frame="map", labels=[0, -1], centroids=[[0, 0, 0]]),
-        {"labels": [1, -2]},
-        r"Clusters\.labels\[0\] must be -1 or index the 1 clusters of centroids, got 1 \(and 1 more\)",
-    ),
-    (
-        ParticleSet(stamp=0, frame="map", poses=[[0, 0, 0]], weights=[1]),
-        {"weights": [-0.1]},
-        r"ParticleSet\.weights\[0\] must lie in",
-    ),
-    (
-        ParticleSet(stamp=0, frame="map", poses=[[0, 0, 0]], weights=[1]),
-        {"weights": [np.inf]},
-        r"ParticleSet\.weights\[0\] must be finite",
-    ),
-    (
-        ParticleSet(stamp=0, frame="map", poses=[[0, 0, 0]], weights=[1]),
-        {"poses": np.zeros((1, 7))},
-        r"ParticleSet\.poses\[0\] must end in a unit quaternion",
-    ),
-    (
-        LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1]),
-        {"range_min": 5.0, "range_max": 1.0},
-        r"LaserScan\.range_min must be ≤ range_max, got 5\.0 and 1\.0",
-    ),
-    (
-        LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1]),
-        {"angle_min": NAN},
-        r"LaserScan\.angle_min must be finite, got nan",
-    ),
-    (
-        LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1]),
-        {"angle_max": np.inf},
-        r"LaserScan\.angle_max must be finite, got inf",
-    ),
-    (
-        LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1]),
-        {"range_min": -np.inf},
-        r"LaserScan\.range_min must be finite",
-    ),
-    (
-        LaserScan(stamp=0, frame="laser", angle_min=-1, angle_max=1, ranges=[1]),
-        {"range_max": NAN},
-        r"LaserScan\.range_min must be ≤ range_max",
-    ),
-    (WheelTicks(stamp=0, names=("l", "r"), ticks=[1, 2]), {"names": ("l",)}, r"WheelTicks\.names has 1 entries"),
-    (WheelTicks(stamp=0, names=("l", "r"), ticks=[1, 2]), {"names": ("l", "l")}, r"names must be unique, 'l'"),
-    (JointState(stamp=0, names=("a", "b")), {"efforts": [1]}, r"JointState\.names has 2 entries, but efforts has 1"),
-    (JointState(stamp=0, names=("a", "b")), {"names": ("a", "a")}, r"JointState\.names must be unique"),
-    (FeatureVector(stamp=0, model="m", vectors=[[1, 2]]), {"labels": ("a", "b")}, r"FeatureVector\.labels has 2"),
-    (
-        Image(stamp=0, frame="c", data=np.zeros((2, 2), np.uint8)),
-        {"data": np.zeros((0, 2), np.uint8)},
-        r"Image\.data must",
-    ),
-    (
-        DepthImage(stamp=0, frame="c", data=np.zeros((2, 2))),
-        {"data": np.zeros((2, 0))},
-        r"DepthImage\.data must hold at least one element, got shape \(2, 0\)",
-    ),
-    (example(CompressedImage, 0), {"data": [1, 2, 3]}, r"CompressedImage\.data must hold a .* got 3 bytes .* 01 02 03"),
-    (
-        example(CompressedImage, 0),
-        {"format": "jpeg", "data": png8},
-        r"CompressedImage\.data must hold a jpeg file, got 29 bytes that begin with 89 50 .*, which is png",
-    ),
-    (
-        example(CompressedVideo, 0),
-        {"data": [0, 0, 0, 9, 0x65]},
-        r"CompressedVideo\.data must begin with a start code .* got 5 bytes that begin with 00 00 00 09",
-    ),
-    (
-        example(CompressedDepth, 0),
-        {"data": png8},
-        r"CompressedDepth\.data must hold a PNG file with one 16-bit channel",
-    ),
-    (example(CompressedDepth, 0), {"data": []}, r"CompressedDepth\.data must hold a PNG .* got 0 bytes"),
-    (example(CompressedDepth, 0), {"scale": -1.0}, r"CompressedDepth\.scale must be above zero"),
-    (example(CompressedDepth, 0), {"offset": NAN}, r"CompressedDepth\.offset must be finite"),
+    (example(m.Odometry, 0), {"orientation": [0, 0, 0, 2]}, r"Odometry\.orientation"),
+    (example(m.Imu, 0), {"orientation": [0, 0, 0, 2]}, r"Imu\.orientation"),
+    (path, {"stamps": [1, 5, 5]}, r"Path\.stamps must strictly increase, got 5 then 5 at index 2"),
+    (path, {"orientations": [[1] * 4] * 3}, r"Path\.orientations\[0\]"),
+    (mesh, {"triangles": [[0, 1, 3]]}, r"Mesh\.triangles\[0, 2\] must index the 3 vertices, got 3"),
+    (clusters, {"labels": [1, -2]}, r"Clusters\.labels\[0\] must be -1 or .* 1 clusters of centroids, got 1 \(and 1"),
+    (particles, {"weights": [-0.1]}, r"ParticleSet\.weights\[0\] must lie in"),
+    (particles, {"weights": [np.inf]}, r"ParticleSet\.weights\[0\] must be finite"),
+    (particles, {"poses": np.zeros((1, 7))}, r"ParticleSet\.poses\[0\] must end in a unit quaternion"),
+    (scan, {"range_min": 5.0, "range_max": 1.0}, r"LaserScan\.range_min must be ≤ range_max, got 5\.0 and 1\.0"),
+    (scan, {"angle_min": NAN}, r"LaserScan\.angle_min must be finite, got nan"),
+    (scan, {"angle_max": np.inf}, r"LaserScan\.angle_max must be finite, got inf"),
+    (scan, {"range_min": -np.inf}, r"LaserScan\.range_min must be finite"),
+    (scan, {"range_max": NAN}, r"LaserScan\.range_min must be ≤ range_max"),
+    (wheels, {"names": ("l",)}, r"WheelTicks\.names has 1 entries"),
+    (wheels, {"names": ("l", "l")}, r"names must be unique, 'l'"),
+    (joints, {"efforts": [1]}, r"JointState\.names has 2 entries, but efforts has 1"),
+    (joints, {"names": ("a", "a")}, r"JointState\.names must be unique"),
+    (m.FeatureVector(stamp=0, model="m", vectors=[[1, 2]]), {"labels": ("a", "b")}, r"FeatureVector\.labels has 2"),
+    (image, {"data": np.zeros((0, 2), np.uint8)}, r"Image\.data must"),
+    (depth, {"data": np.zeros((2, 0))}, r"DepthImage\.data must hold at least one element, got shape \(2, 0\)"),
+    (picture, {"data": [1, 2, 3]}, r"CompressedImage\.data must hold a .* got 3 bytes .* 01 02 03"),
+    (picture, {"format": "jpeg", "data": png8}, r"a jpeg file, got 29 bytes that begin with 89 50 .*, which is png"),
+    (video, {"data": [0, 0, 0, 9, 0x65]}, r"begin with a start code .* got 5 bytes that begin with 00 00 00 09"),
+    (packed, {"data": png8}, r"CompressedDepth\.data must hold a PNG file with one 16-bit channel"),
+    (m.Switch(stamp=1, on=True), {"on": 1}, r"Switch\.on must be a bool"),
+    (m.Alarm(stamp=1, level="error", name="x"), {"level": "bad"}, r"one of debug, info, warning, error, fatal"),
+    (packed, {"data": []}, r"CompressedDepth\.data must hold a PNG .* got 0 bytes"),
+    (packed, {"scale": -1.0}, r"CompressedDepth\.scale must be above zero"),
+    (packed, {"offset": NAN}, r"CompressedDepth\.offset must be finite"),
 ]
 
 
@@ -371,8 +241,8 @@ def _as_decoded(field: ArrayField, data: Any) -> NDArray[Any] | None:
 
 def test_what_means_nothing_was_measured_is_kept() -> None:
     odd = np.array([[0.0, -0.0, NAN, np.inf, -1.0]], np.float32)
-    assert DepthImage(stamp=0, frame="c", data=odd).data.tobytes() == odd.tobytes()
-    assert PointCloud(stamp=0, frame="l", points=odd[:, :3]).points.tobytes() == odd[:, :3].tobytes()
+    assert m.DepthImage(stamp=0, frame="c", data=odd).data.tobytes() == odd.tobytes()
+    assert m.PointCloud(stamp=0, frame="l", points=odd[:, :3]).points.tobytes() == odd[:, :3].tobytes()
     assert LaserScan(stamp=0, frame="l", angle_min=0, angle_max=1, ranges=odd[0]).ranges.tobytes() == odd.tobytes()
     assert fix.replace(status="no_fix", latitude=NAN, longitude=NAN, altitude=NAN).status == "no_fix"
     assert segments.replace(confidence=np.full((2, 2), NAN)).confidence is not None

@@ -5,25 +5,10 @@ from __future__ import annotations
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from dataflow.messages import Alarm, MessageError, Number, Switch, Text
+from dataflow.messages import Alarm
 from dataflow.messages.values import ALARM_LEVELS
 from dataflow.recording.streams.codecs import SchemaText, codec_for
 from dataflow.recording.streams.foreign import foreign_decoder
-
-
-def test_they_are_made_in_one_line() -> None:
-    assert Number(stamp=1, value=3).value == 3.0
-    assert Number(stamp=1, value=21.5, unit="°C").unit == "°C"
-    assert Text(stamp=1, text="stop").text == "stop"
-    assert Switch(stamp=1, on=True).on is True
-    assert Alarm(stamp=1, level="error", name="battery", text="3 % left").level == "error"
-
-
-def test_a_switch_takes_no_number_and_an_alarm_no_other_level() -> None:
-    with pytest.raises(MessageError, match=r"Switch\.on must be a bool"):
-        Switch(stamp=1, on=1)  # type: ignore[arg-type]
-    with pytest.raises(MessageError, match="one of debug, info, warning, error, fatal"):
-        Alarm(stamp=1, level="bad", name="battery")
 
 
 def test_the_severity_of_alarms_grows_with_their_level() -> None:

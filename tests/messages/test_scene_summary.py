@@ -29,18 +29,14 @@ def graph(classes: str, *relations: Relation, places: Mapping[int, int] | None =
     words = classes.split()
     names = tuple(dict.fromkeys(words))
     return SceneGraph(
-        stamp=0,
-        frame="map",
-        class_names=names,
-        predicates=tuple(p for _, p, _, _ in relations),
+        stamp=0, frame="map", class_names=names, predicates=tuple(p for _, p, _, _ in relations),
         ids=np.array([(places or {}).get(k, k + 1) for k in range(len(words))]),
         class_ids=np.array([names.index(word) for word in words], np.int32),
-        positions=np.zeros((len(words), 3)),
-        sizes=np.ones((len(words), 3)),
+        positions=np.zeros((len(words), 3)), sizes=np.ones((len(words), 3)),
         subjects=np.array([s for s, _, _, _ in relations], np.int32),
         objects=np.array([o for _, _, o, _ in relations], np.int32),
         relation_scores=np.array([score for _, _, _, score in relations], np.float32),
-    )
+    )  # fmt: skip
 
 
 def test_a_thing_is_carried_by_the_likeliest_alone() -> None:
@@ -103,12 +99,9 @@ def test_intentions_are_told_however_unlikely_and_the_likeliest_first() -> None:
 def test_people_come_with_what_they_do_and_a_ball_beside_them_is_what_moves() -> None:
     scene = graph("ball person chair", (1, "heads_for", 2, 0.76), (0, "on", 2, 0.9))
     acts = Activity(
-        stamp=0,
-        class_names=("walking", "resting"),
-        subjects=np.array([2, 1]),
-        class_ids=np.array([0, 1], np.int32),
-        scores=np.array([0.9, 0.5], np.float32),
-    )
+        stamp=0, class_names=("walking", "resting"), subjects=np.array([2, 1]),
+        class_ids=np.array([0, 1], np.int32), scores=np.array([0.9, 0.5], np.float32),
+    )  # fmt: skip
     told = summarize(scene, acts)
     assert agents_in_words(scene, told, acts) == [Row("person 2", "walking 90 %, heads for chair 3 (76 %)")]
     assert movers_in_words(scene, told, acts) == [Row("ball 1", "resting 50 %, on chair 3")]
@@ -121,10 +114,7 @@ def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone
         places={0: 0},
     )  # fmt: skip
     rows = carriers_in_words(scene, summarize(scene))
-    assert [(row.name, row.text) for row in rows] == [
-        ("table 2", "on it 2 books; in it mug 5"),
-        ("floor 0", "lamp 6"),
-    ]
+    assert [(row.name, row.text) for row in rows] == [("table 2", "on it 2 books; in it mug 5"), ("floor 0", "lamp 6")]
 
 
 def test_agents_are_what_acts_whatever_its_class() -> None:

@@ -25,7 +25,7 @@ def test_a_clock_that_is_read_often_goes_on_as_time_does() -> None:
     assert clock.take_lost() == 0.0
 
 
-def test_a_time_in_which_nobody_read_it_counts_as_one_step() -> None:
+def test_time_without_readings_counts_as_one_step() -> None:
     hands = Hands()
     clock = AwakeClock(hands)
     hands.now += 6.0

@@ -78,7 +78,7 @@ def flown(
     def due(node: str, stamp: int) -> int:
         return stamp if node == "left" or not lag else max(stamp, SECOND) + lag
 
-    flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
+    flight = replace(graph.record.flight, when=when, **more)
     made = replace(graph, record=replace(graph.record, flight=flight))
     history: list[tuple[int, int]] = []
     asks, clock = sorted(asks), 0

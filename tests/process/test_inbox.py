@@ -61,7 +61,7 @@ def test_an_empty_inbox_is_waited_for_no_longer_than_asked(wired: Wired) -> None
 
 
 @pytest.mark.parametrize("through", ["ring", "thread"])
-def test_who_waits_is_woken_by_what_arrives(wired: Wired, through: str) -> None:
+def test_waiting_thread_is_woken_by_arrivals(wired: Wired, through: str) -> None:
     act = (lambda: wired.send(b"x")) if through == "ring" else (lambda: wired.inbox.put(("control", "go", {})))
     timer = threading.Timer(0.02, act)
     timer.start()
@@ -69,7 +69,7 @@ def test_who_waits_is_woken_by_what_arrives(wired: Wired, through: str) -> None:
     timer.join()
 
 
-def test_who_waits_is_woken_when_a_ring_that_was_full_has_room(wired: Wired) -> None:
+def test_waiting_writer_is_woken_when_a_full_ring_has_room(wired: Wired) -> None:
     sender = Inbox(wired.back)
     while not wired.producer.waiting:
         wired.send(bytes(900))
@@ -100,7 +100,7 @@ def test_a_failed_process_waits_for_the_supervisor_whatever_else_wakes_it() -> N
                 raise queue.Empty
             return item
 
-    assert await_leave(Woken())  # type: ignore[arg-type]
+    assert await_leave(Woken())
 
 
 def test_the_turn_is_another_threads_only_while_the_one_that_has_it_waits_for_nothing(wired: Wired) -> None:
@@ -141,7 +141,7 @@ def test_the_thread_that_waits_is_woken_for_what_another_has_left_it(wired: Wire
     thread.join()
 
 
-def test_what_has_woken_the_one_who_waits_does_not_wake_it_again(wired: Wired) -> None:
+def test_one_wakeup_wakes_the_waiting_thread_once(wired: Wired) -> None:
     os.eventfd_write(wired.wake, 1)
     with pytest.raises(queue.Empty):
         wired.inbox.get(timeout=LONG)

@@ -23,10 +23,10 @@ class Inflow:
         self.channel = RecordedChannel()
         self.now = 0.0
         self.inlet = Inlet(
-            self.channel,  # type: ignore[arg-type]
+            self.channel,
             lambda stream, envelope: self.delivered.append((envelope.kind, envelope.seq)),
             static=static,
-            losses=losses_of("taker", self.channel, live=live),  # type: ignore[arg-type]
+            losses=losses_of("taker", self.channel, live=live),
             from_start=from_start,
             complaints=ThrottledWarnings(lambda: self.now, lambda line: self.printed.append(line) is None),
         )
@@ -77,7 +77,7 @@ def test_the_loss_of_the_last_messages_is_noticed_too() -> None:
         Inflow(live=False).take(message(0), frontier(3, 1020), end(3, 1020))
 
 
-def test_messages_that_are_lost_before_the_first_are_a_gap_for_who_was_there_from_the_start() -> None:
+def test_messages_lost_before_the_first_are_a_gap_for_a_consumer_from_the_start() -> None:
     lossy, late = Inflow(from_start=True), Inflow()
 
     for inflow in (lossy, late):
@@ -106,7 +106,7 @@ def test_garbage_is_counted_and_complained_about_once_in_a_while() -> None:
     assert "(1999 more like it before)" in inflow.printed[1]
 
 
-def test_what_nobody_reads_is_counted_instead_of_waited_for() -> None:
+def test_unread_warnings_are_counted_instead_of_waited_for() -> None:
     read: list[str] = []
     reading = False
     complaints = ThrottledWarnings(lambda: 0.0, lambda line: reading and read.append(line) is None)
@@ -139,7 +139,7 @@ def test_a_static_stream_is_taken_once_and_its_end_only_after_it() -> None:
     assert not inflow.inlet.statics_missing([STREAM])
 
 
-def test_a_probe_is_told_of_once_until_its_process_was_restarted() -> None:
+def test_probe_is_reported_once_until_its_process_was_restarted() -> None:
     inflow = Inflow()
     probe = Envelope(Kind.PROBE, STREAM, 0, 1, 0)
 

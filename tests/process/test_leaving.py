@@ -34,7 +34,7 @@ class Stuck:
 def test_the_parts_are_closed_in_turn_and_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     closed: list[str] = []
 
-    leave_network("head", Part(closed, "taps"), Part(closed, "bus"))
+    leave_network("head", Part(closed, "taps").close, Part(closed, "bus").close)
 
     assert closed == ["taps", "bus"]
     assert capsys.readouterr().err == ""
@@ -46,7 +46,7 @@ def test_a_part_that_hangs_is_left_behind_and_named(
     monkeypatch.setattr(network, "LEAVE_WITHIN", 0.01)
     stuck = Stuck()
     try:
-        leave_network("head", stuck, Part([], "bus"))
+        leave_network("head", stuck.close, Part([], "bus").close)
     finally:
         stuck.gate.set()
 
@@ -54,6 +54,6 @@ def test_a_part_that_hangs_is_left_behind_and_named(
 
 
 def test_a_network_that_fails_at_the_end_does_not_fail_the_run(capsys: pytest.CaptureFixture[str]) -> None:
-    leave_network("head", Part([], "taps", BusError("Zenoh did not close within 20 s")))
+    leave_network("head", Part([], "taps", BusError("Zenoh did not close within 20 s")).close)
 
     assert "leaves the network unheard: Zenoh did not close within 20 s" in capsys.readouterr().err

@@ -63,7 +63,7 @@ class Sources:
         window, backlog = Window(256, 1 << 20), Window(4096, 1 << 24)
         self.live = LiveSources(
             self.inbox,
-            self.channel,  # type: ignore[arg-type]
+            self.channel,
             Pace(None),
             window,
             backlog,
@@ -168,30 +168,6 @@ def test_any_exception_of_the_thread_ends_the_source_under_its_name(monkeypatch:
 
     with pytest.raises(OperatorFailure, match=r"'camera' failed in the thread .*AssertionError: a fault of the"):
         Sources("Count").run()
-
-
-def test_a_source_is_closed_when_its_stream_has_returned() -> None:
-    sources = Sources("Blocks")
-    assert process_operators.Blocks.waiting.wait(10)
-    process_operators.Blocks.let_go.set()
-
-    late, failures = sources.live.await_readers()
-
-    assert (late, failures) == (set(), [])
-    assert process_operators.Blocks.ends == [("stream", "source camera")]
-
-
-def test_a_stream_that_does_not_return_is_named_and_left_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(live_sources, "RETURN_WITHIN", 0.05)
-    sources = Sources("Blocks")
-    assert process_operators.Blocks.waiting.wait(10)
-
-    late, _ = sources.live.await_readers()
-
-    assert late == {"camera"}
-    assert "source 'camera' did not return within 0.05 s: close() is not called" in capsys.readouterr().err
 
 
 def test_the_restart_that_is_pending_is_forgotten_when_the_run_is_stopped() -> None:

@@ -53,7 +53,7 @@ class OneProcess:
         self.channel = RecordedChannel()
         takes = [STREAM] if runs == "last" else []
         config = ProcessConfig(runs, graph.to_json(), [runs], {}, takes, [], live=live, firings=True)
-        self.process = OperatorProcess(config, self.channel, self.inbox, box=box)  # type: ignore[arg-type]
+        self.process = OperatorProcess(config, self.channel, self.inbox, box=box)
         self.process.make()
         for runner in self.process.driver.all:
             runner.setup()
@@ -76,7 +76,7 @@ class OneProcess:
             if sent(kind, fields):
                 self.inbox.put(("control", "leave", {}))
 
-        self.process.progress._channel = SimpleNamespace(send=answer)  # type: ignore[assignment]
+        self.process.progress._channel = SimpleNamespace(send=answer)
 
 
 def test_what_is_done_is_reported_when_there_is_nothing_more_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +155,7 @@ def test_libraries_that_setup_imports_are_limited_to_the_threads_of_the_graph(mo
     runner = one.process.driver.operators[0]
 
     def setup() -> None:
-        monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append))  # type: ignore[arg-type]
+        monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append))
 
     monkeypatch.setattr(runner.operator, "setup", setup)
 
@@ -217,14 +217,15 @@ def test_a_source_is_not_closed_while_its_stream_is_read(blocked: OneProcess) ->
 
     blocked.process.close()
 
-    assert [what for what, _ in process_operators.Blocks.ends] == ["stream", "close"]
+    assert process_operators.Blocks.ends == [("stream", "source camera"), ("close", "MainThread")]
 
 
 def test_a_source_whose_stream_does_not_return_is_not_closed_at_all(
-    blocked: OneProcess, monkeypatch: pytest.MonkeyPatch
+    blocked: OneProcess, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(live_sources, "RETURN_WITHIN", 0.05)
 
     blocked.process.close()
 
     assert process_operators.Blocks.ends == []
+    assert "source 'camera' did not return within 0.05 s: close() is not called" in capsys.readouterr().err

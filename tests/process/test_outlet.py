@@ -30,7 +30,7 @@ class Linked:
         self.descriptors = make_ring(4096), os.eventfd(0, os.EFD_NONBLOCK), make_board()
         link = Outgoing(*self.descriptors, most)
         self.outlet = Outlet(
-            RecordedChannel(),  # type: ignore[arg-type]
+            RecordedChannel(),
             {},
             fanout=Fanout([([INFO, FAST], link)]),
             namespace="test",
@@ -76,7 +76,7 @@ def test_nothing_is_sent_before_it_is_released_and_then_all_of_it_once(linked: L
     assert linked.outlet.sent == 2
 
 
-def test_who_was_started_again_is_sent_the_static_messages_again_and_they_count_as_sent(linked: Linked) -> None:
+def test_restarted_consumer_gets_static_messages_again_and_they_count_as_sent(linked: Linked) -> None:
     linked.outlet.release()
     linked.outlet.message(INFO, entry(INFO, 0, 0))
     linked.outlet.end(INFO, None, "over")
@@ -118,9 +118,9 @@ def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: 
     ]
 
 
-def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_message_and_end(linked: Linked) -> None:
+def test_restarted_process_sends_only_message_and_end_on_a_static_stream(linked: Linked) -> None:
     linked.outlet = Outlet(
-        RecordedChannel(),  # type: ignore[arg-type]
+        RecordedChannel(),
         {},
         fanout=Fanout([([INFO, FAST], Outgoing(*linked.descriptors, None))]),
         namespace="test",
@@ -142,7 +142,7 @@ def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_m
     ]
 
 
-def test_who_leaves_says_that_something_had_no_room(
+def test_unsent_messages_are_reported_when_a_process_leaves(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(outlet, "PUSH_WITHIN", 0.0)

@@ -484,7 +484,7 @@ def test_one_message_that_is_refused_costs_that_message_alone(
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o644])
-def test_a_recording_is_readable_by_whom_it_is_meant_for(graph: Graph, tmp_path: Path, mode: int) -> None:
+def test_recording_has_the_configured_mode(graph: Graph, tmp_path: Path, mode: int) -> None:
     before = os.umask(0o000)
     try:
         storage = Storage(Splitting(every=SECOND), mode=mode)

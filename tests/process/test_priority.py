@@ -14,7 +14,7 @@ import pytest
 
 from dataflow.graph import load_graph
 from dataflow.process import priority
-from dataflow.sinks import live_sink
+from dataflow.sinks import sink
 from dataflow.sinks.sink import SinkConfig
 from dataflow.supervision import process_main as main
 
@@ -50,11 +50,11 @@ def test_on_an_unknown_machine_nothing_changes(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize("live", [True, False])
 def test_sinks_of_live_runs_let_others_begin(monkeypatch: pytest.MonkeyPatch, live: bool) -> None:
     asked: list[bool] = []
-    monkeypatch.setattr(live_sink, "let_others_begin", lambda: asked.append(True))
+    monkeypatch.setattr(sink, "let_others_begin", lambda: asked.append(True))
     monkeypatch.setattr(main, "_recorder", lambda *_: SimpleNamespace())
     config = SinkConfig("@recorder", "record", load_graph(GRAPH).to_json(), [], [], {}, live=live)
     channel: Any = SimpleNamespace(send=lambda *_, **__: None)
 
-    main._make("sink", asdict(config), channel, SimpleNamespace(), None).open()  # type: ignore[arg-type]
+    main._make("sink", asdict(config), channel, SimpleNamespace(), None).open()
 
     assert asked == [True] * live

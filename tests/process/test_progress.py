@@ -26,7 +26,7 @@ class Reporting:
         )  # fmt: skip
         self.channel, self.now = RecordedChannel(), 0.0
         driver = Driver()
-        driver.operators.append(self.operator)  # type: ignore[arg-type]
+        driver.operators.append(self.operator)
         live: Any = SimpleNamespace(runners=[], behind=dict)
         channel: Any = self.channel
         self.progress = Progress(channel, driver, live, lambda: self.now)
@@ -62,12 +62,6 @@ def test_a_busy_process_reports_now_and_then() -> None:
     assert one.progress.next_due() is None
 
 
-def test_what_an_operator_found_is_kept_with_its_counts() -> None:
-    one = Reporting()
-    one.fires(idle=True)
-    assert one.progress.found == {"last": "10 things lie askew"}
-
-
 def test_an_idle_process_reports_at_once_or_wakes_up_to_do_so() -> None:
     one = Reporting()
     one.fires(idle=True)
@@ -83,7 +77,7 @@ def test_an_idle_process_reports_at_once_or_wakes_up_to_do_so() -> None:
     assert one.progress.next_due() is None
 
 
-def test_a_process_in_which_nothing_changed_says_nothing() -> None:
+def test_unchanged_process_reports_nothing() -> None:
     one = Reporting()
     one.fires(idle=True)
     one.now += 1.0
@@ -110,7 +104,7 @@ def test_counts_that_a_busy_process_has_left_out_follow_when_it_is_idle() -> Non
     assert len(one.channel.of("progress")) == 3
 
 
-def test_what_is_owed_is_told_at_once_to_who_asks() -> None:
+def test_pending_progress_is_reported_at_once_on_request() -> None:
     one = Reporting()
     one.fires(idle=True)
     one.fires(idle=True)

@@ -71,7 +71,7 @@ def test_another_process_in_its_place_is_asked_from_its_beginning() -> None:
     assert decode_batch(answer["batches"][0]).records[0].index == 5
 
 
-def test_a_failure_is_told_with_the_beginning_of_its_text() -> None:
+def test_failure_keeps_the_beginning_of_its_text() -> None:
     recent = RecentFirings()
     recent.add(FiringRecord("op", 0, 0, "fire", 0, outcome="error", detail={"error": "e" * 900, "more": 1}))
 
@@ -79,7 +79,3 @@ def test_a_failure_is_told_with_the_beginning_of_its_text() -> None:
 
     assert decode_batch(batch).records[0].detail == {"error": "e" * 500}
     assert recent.batches() == []
-
-
-def test_nothing_is_answered_before_the_first_firing() -> None:
-    assert kept() == []

@@ -56,8 +56,8 @@ class Recorder:
         graph = load_text(GRAPH)
         self.channel, self.stored = RecordedChannel(), Stored()
         config = SinkConfig("@recorder", "record", graph.to_json(), [], ["camera", "last"], {}, live=True)
-        self.process = SinkProcess(config, self.channel, Arrived(), lambda *_: self.stored)  # type: ignore[arg-type]
-        self.process.sink = self.stored  # type: ignore[assignment]
+        self.process = SinkProcess(config, self.channel, Arrived(), lambda *_: self.stored)
+        self.process.sink = self.stored
 
     def arrives(self, *places: tuple[int, int], operator: str = "last", key: str = KEY) -> None:
         self.process._receive(key, batch(*places, operator=operator))
@@ -123,7 +123,7 @@ def test_an_end_that_was_still_on_its_way_from_the_process_before_is_not_that_of
     recorder = Recorder()
     recorder.process._open.add(STREAM)
     recorder.process.frontiers[STREAM] = 0
-    recorder.stored.end = lambda *_: None  # type: ignore[attr-defined]
+    recorder.stored.end = lambda *_: None
     begins = {"camera": 1, "last": 1}
     recorder.process._control("expect", {"streams": [STREAM, KEY, CAMERA], "times": 1, "begins": begins})
     for incarnation in (0, 1):
@@ -183,7 +183,7 @@ def test_records_of_an_operator_are_stored_in_the_order_of_its_calls_though_no_m
     sink = RecorderSink(tmp_path / "run.mcap", graph, [], options)
     for index, (kind, stamp) in enumerate([("setup", NEVER), ("finish", 0), ("param", 7)]):
         detail = {"name": "gain", "value": 1.0} if kind == "param" else {}
-        record = FiringRecord("last", 0, index, kind, stamp, detail=detail)  # type: ignore[arg-type]
+        record = FiringRecord("last", 0, index, kind, stamp, detail=detail)
         sink.firings("last", stamp, encode_batch([record]))
     sink.close("complete")
 

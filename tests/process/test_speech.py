@@ -43,7 +43,7 @@ def test_what_is_no_line_of_ours_is_text(text: str) -> None:
     assert heard(MARK + json.dumps(["x"]), "p", ()).text == '["x"]'
 
 
-def test_the_only_operator_of_a_process_is_meant_where_nobody_is_named() -> None:
+def test_line_without_operator_is_attributed_to_the_only_one() -> None:
     assert heard("x", "p", ("camera",)).operator == "camera"
     assert heard("x", "p", ("camera", "lidar")).operator == ""
     forged = MARK + json.dumps(LogLine("info", "x", operator="somebody else").to_json())
@@ -63,7 +63,7 @@ def test_a_call_under_way_names_its_operator_and_event_time() -> None:
     assert [(line.operator, line.stamp) for line in found] == [("lidar", 7), ("", None), ("camera", None)]
 
 
-def test_a_very_long_line_is_cut_and_says_so() -> None:
+def test_very_long_line_is_cut_with_a_note() -> None:
     (line,) = piped(lambda descriptor: _say(descriptor, "info", "x" * (LONGEST + 5), ""))
     assert heard(line, "p", ()).text.endswith("x… (5 characters more)")
 

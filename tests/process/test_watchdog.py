@@ -33,7 +33,7 @@ class Beats:
 
 def test_an_unexpected_exception_does_not_end_the_watching(capsys: pytest.CaptureFixture[str]) -> None:
     beats = Beats(ValueError("who is this"))
-    watchdog = Watchdog(beats, [], deadlines=True)  # type: ignore[arg-type]
+    watchdog = Watchdog(beats, [], deadlines=True)
 
     assert beats.heard.wait(10)
     watchdog.stop()
@@ -48,7 +48,7 @@ def test_a_process_whose_memory_is_unknown_still_gives_signs_of_life(monkeypatch
 
     monkeypatch.setattr(psutil.Process, "memory_info", unknown)
     beats = Beats()
-    watchdog = Watchdog(beats, [], deadlines=True)  # type: ignore[arg-type]
+    watchdog = Watchdog(beats, [], deadlines=True)
 
     assert beats.heard.wait(10)
     watchdog.stop()
@@ -58,7 +58,7 @@ def test_a_process_whose_memory_is_unknown_still_gives_signs_of_life(monkeypatch
 
 def test_the_watching_ends_when_the_supervisor_is_gone() -> None:
     beats = Beats(ChannelClosed("gone"))
-    watchdog = Watchdog(beats, [], deadlines=True)  # type: ignore[arg-type]
+    watchdog = Watchdog(beats, [], deadlines=True)
 
     assert beats.refused.wait(10)
     watchdog._thread.join(10)
@@ -80,7 +80,7 @@ class Looked:
         monkeypatch.setattr(module, "time", clock)
         node = SimpleNamespace(name="n", live=SimpleNamespace(deadline=200_000_000))
         self.runner = SimpleNamespace(node=node, working_since=10.0, working_stamp=5)
-        self._watchdog = Watchdog(self, [self.runner], deadlines=True)  # type: ignore[arg-type, list-item]
+        self._watchdog = Watchdog(self, [self.runner], deadlines=True)
 
     def send(self, kind: str, /, **fields: Any) -> None:
         if kind == "overdue":

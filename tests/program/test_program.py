@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +41,8 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def relay(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Relay]:
     monkeypatch.setattr(Relay, "command", (str(compiled),))
-    operator = Relay(first=5, fail=9, crash=8)
-    operator.setup()
-    yield operator
-    operator.close()
+    with started(operator := Relay(first=5, fail=9, crash=8)):
+        yield operator
 
 
 def number(stamp: int, value: float = 0.0) -> Number:
@@ -55,6 +53,13 @@ def call(operator: Program, stamp: int, **given: Message | tuple[Message, ...] |
     outputs = operator.process(Context(stamp), **given)
     assert isinstance(outputs, dict)
     return outputs
+
+
+@contextmanager
+def started(operator: Program) -> Iterator[Program]:
+    operator.setup()
+    yield operator
+    operator.close()
 
 
 def test_messages_of_every_type_come_back_bit_for_bit_from_cpp(relay: Relay) -> None:
@@ -153,11 +158,8 @@ def test_a_run_in_processes_verifies_and_a_changed_program_is_named(
     ],
 )
 def test_what_is_no_reply_ends_the_program(fault: str, text: str) -> None:
-    operator = faulty(fault)()
-    operator.setup()
-    with pytest.raises(ProgramError, match=text):
+    with started(faulty(fault)()) as operator, pytest.raises(ProgramError, match=text):
         call(operator, 7, number=number(7))
-    operator.close()
 
 
 @pytest.mark.parametrize(
@@ -168,15 +170,12 @@ def test_what_is_no_reply_ends_the_program(fault: str, text: str) -> None:
     ],
 )
 def test_a_reply_that_is_no_message_is_refused(fault: str, text: str) -> None:
-    operator = faulty(fault)()
-    operator.setup()
-    with pytest.raises(OutputError, match=text):
+    with started(faulty(fault)()) as operator, pytest.raises(OutputError, match=text):
         call(operator, 7, number=number(7))
-    operator.close()
 
 
 @pytest.mark.parametrize("fault", ["text", "half", "garbage"])
-def test_what_a_program_does_wrong_is_told_without_lines_of_the_engine(fault: str) -> None:
+def test_program_errors_have_no_traceback_of_the_engine(fault: str) -> None:
     with pytest.raises(OperatorFailure, match="python") as raised:
         play(faulty(fault)(), {"number": [number(1)]})
     assert raised.value.traceback == ""
@@ -188,11 +187,11 @@ def test_a_port_that_is_not_declared_is_named() -> None:
 
 
 def test_a_program_without_answer_is_killed_in_its_time() -> None:
-    operator = faulty("silent", patience=0.5)()
-    operator.setup()
-    with pytest.raises(ProgramError, match=r"process\(\) at 7: no answer in 0.5 s"):
+    with (
+        started(faulty("silent", patience=0.5)()) as operator,
+        pytest.raises(ProgramError, match=r"process\(\) at 7: no answer in 0.5 s"),
+    ):
         call(operator, 7, number=number(7))
-    operator.close()
 
 
 def test_a_call_behind_the_end_writes_into_no_other_file(tmp_path: Path) -> None:

@@ -25,10 +25,10 @@ HALF = float(np.sqrt(0.5))
 
 
 def decoded(proto: object) -> object:
-    name = proto.DESCRIPTOR.full_name  # type: ignore[attr-defined]
+    name = proto.DESCRIPTOR.full_name
     decode = foreign_decoder("protobuf", SchemaText(name, "protobuf", b""))
     assert decode is not None
-    return decode(proto.SerializeToString(), 5)  # type: ignore[attr-defined]
+    return decode(proto.SerializeToString(), 5)
 
 
 def cloud() -> PointCloud:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from example_messages import example
-from mcap.writer import Writer
+from made_recordings import foreign, recorded
 
 from dataflow.messages import CameraInfo, Imu, Message, Odometry
 from dataflow.messages.base import is_built_in, message_types
@@ -69,11 +69,7 @@ def test_columns_of_any_type_are_exact(cls: type[Message], tmp_path: Path) -> No
     """Also where fields hold what plain JSON cannot: NaN with a payload, -0.0, large integers, empty sets."""
     messages = [example(cls, seed).replace(stamp=seed + 1) for seed in (0, 1, 2, 3, 0, 4)]
     messages = [message.replace(stamp=stamp) for stamp, message in enumerate(messages, 1)]
-    with RecordingWriter(tmp_path / "any.mcap", metadata={}) as writer:
-        writer.add_stream("any", cls)
-        for seq, message in enumerate(messages):
-            writer.write("any", message, seq=seq)
-    with Recording(tmp_path / "any.mcap") as recording:
+    with Recording(recorded(tmp_path / "any.mcap", [("any", message) for message in messages])) as recording:
         columns = recording.index("any").columns(np.arange(6), [field.name for field in cls.FIELDS])
 
     rebuilt = [{name: values[i] for name, values in columns.items()} for i in range(6)]
@@ -82,11 +78,8 @@ def test_columns_of_any_type_are_exact(cls: type[Message], tmp_path: Path) -> No
 
 def test_columns_of_many_messages_are_joined_from_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "BATCH", 3)
-    with RecordingWriter(tmp_path / "many.mcap", metadata={}) as writer:
-        writer.add_stream("imu", Imu)
-        for i in range(8):
-            writer.write("imu", imu(i + 1, temperature=1.5 if i == 7 else None), seq=i)
-    with Recording(tmp_path / "many.mcap") as recording:
+    rows = [("imu", imu(i + 1, temperature=1.5 if i == 7 else None)) for i in range(8)]
+    with Recording(recorded(tmp_path / "many.mcap", rows)) as recording:
         found = recording.index("imu").columns(np.arange(8), ["angular_velocity", "temperature"])
 
     assert np.asarray(found["angular_velocity"])[:, 0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
@@ -94,17 +87,12 @@ def test_columns_of_many_messages_are_joined_from_batches(tmp_path: Path, monkey
 
 
 def test_columns_of_another_programs_stream_are_those_of_its_messages(tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as out:
-        writer = Writer(out)
-        writer.start()
-        schema = writer.register_schema("foxglove.RawImage", "jsonschema", b"{}")
-        channel = writer.register_channel("/grey", "json", schema)
-        for k in range(3):
-            image = {"width": 2, "height": 1, "encoding": "mono8", "step": 2, "frame_id": f"camera{k}"}
-            data = json.dumps({**image, "data": base64.b64encode(bytes([k, k + 1])).decode()}).encode()
-            writer.add_message(channel, log_time=k, publish_time=k, data=data)
-        writer.finish()
+    messages = []
+    for k in range(3):
+        image = {"width": 2, "height": 1, "encoding": "mono8", "step": 2, "frame_id": f"camera{k}"}
+        data = base64.b64encode(bytes([k, k + 1])).decode()
+        messages.append((k, json.dumps({**image, "data": data}).encode()))
+    path = foreign(tmp_path / "foreign.mcap", ("/grey", "json", ("foxglove.RawImage", "jsonschema", b"{}"), messages))
 
     with Recording(path) as recording:
         found = recording.index("/grey").columns(np.arange(3), ["frame", "data"])
@@ -115,16 +103,10 @@ def test_columns_of_another_programs_stream_are_those_of_its_messages(tmp_path: 
 
 @pytest.mark.parametrize("damage", [b'{"value":[1],"unit":""}', b'{"value":', b"[1]", b'{"_exact":3}'])
 def test_a_message_that_does_not_decode_is_named(tmp_path: Path, damage: bytes) -> None:
-    path = tmp_path / "damaged.mcap"
-    with path.open("wb") as out:
-        writer = Writer(out)
-        writer.start()
-        metadata = {"kind": "stream", "message_type": "Number", "static": "false", "incarnation": "0"}
-        schema = writer.register_schema("dataflow.Number", "jsonschema", b"{}")
-        channel = writer.register_channel("number", "json", schema, metadata)
-        for i, data in enumerate((b'{"value":1.0,"unit":""}', damage)):
-            writer.add_message(channel, log_time=i + 1, publish_time=i + 1, sequence=i, data=data)
-        writer.finish()
+    facts = {"kind": "stream", "message_type": "Number", "static": "false", "incarnation": "0"}
+    messages = [(1, b'{"value":1.0,"unit":""}'), (2, damage)]
+    number = ("number", "json", ("dataflow.Number", "jsonschema", b"{}"), messages)
+    path = foreign(tmp_path / "damaged.mcap", number, of_channels=facts)
 
     with Recording(path) as recording:
         with pytest.raises(RecordingError, match="stream 'number', message 1 at 2") as one:

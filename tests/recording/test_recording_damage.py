@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_recordings import pose
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
@@ -22,7 +23,7 @@ from dataflow.recording.mcap.seals import Seal, seal_of, sealed
 FLIPS_PER_KIND = 40
 
 
-def write(path: Path) -> None:
+def write(path: Path) -> Path:
     """Every kind of record: streams with and without a companion, a static one, firing records, events, metadata."""
     metadata = {"dataflow:graph": {"text": "graph: g\n" * 20}, "note": {"robot": "kitchen 3"}}
     with RecordingWriter(path, metadata=metadata, namespace="r", chunk_bytes=1500, chunk_seconds=1e9) as writer:
@@ -40,37 +41,29 @@ def write(path: Path) -> None:
             if i % 4 == 3:
                 writer.write_event("gap", stamp, {"from": i})
                 writer.flush()
+    return path
 
 
 def content(path: Path) -> tuple[dict[str, Any], bool]:
     """Everything that a reader is given, and whether a note says that the file is damaged."""
     with Recording(path) as recording:
-        messages = [(m.stream, m.stamp, m.seq, m.incarnation, m.message.digest()) for m in recording.messages()]
-        ranged = [(m.stream, m.stamp) for m in recording.messages(start=1030, end=1080)]
-        raw = [(r.stream, r.schema, r.encoding, r.log_time, r.sequence, r.data) for r in recording.raw()]
-        streams = {
-            name: (i.static, i.message_type, i.count, i.first, i.last, dict(i.metadata))
-            for name, i in recording.streams.items()
+        streams = recording.streams
+        found = {
+            "messages": [(m.stream, m.stamp, m.seq, m.incarnation, m.message.digest()) for m in recording.messages()],
+            "ranged": [(m.stream, m.stamp) for m in recording.messages(start=1030, end=1080)],
+            "raw": [(r.stream, r.schema, r.encoding, r.log_time, r.sequence, r.data) for r in recording.raw()],
+            "streams": {
+                name: (info.static, info.message_type, info.count, info.first, info.last, dict(info.metadata))
+                for name, info in streams.items()
+            },
+            "sizes": {name: info.bytes for name, info in streams.items()},
+            "counts": {name: dict(recording.counts(name)) for name in streams},
+            "firings": (list(recording.firings()), recording.firing_batches()),
+            "events": [(e.name, e.stamp, dict(e.data)) for e in recording.events()],
+            "metadata": {name: dict(mapping) for name, mapping in recording.metadata.items()},
+            "facts": (recording.library, recording.profile),
         }
-        sizes = {name: i.bytes for name, i in recording.streams.items()}
-        counts = {name: dict(recording.counts(name)) for name in recording.streams}
-        firings = list(recording.firings()), recording.firing_batches()
-        events = [(e.name, e.stamp, dict(e.data)) for e in recording.events()]
-        metadata = {name: dict(mapping) for name, mapping in recording.metadata.items()}
-        facts = recording.library, recording.profile
-        noted = recording.torn or bool(recording.damage)
-    return {
-        "messages": messages,
-        "ranged": ranged,
-        "raw": raw,
-        "streams": streams,
-        "sizes": sizes,
-        "counts": counts,
-        "firings": firings,
-        "events": events,
-        "metadata": metadata,
-        "facts": facts,
-    }, noted
+        return found, recording.torn or bool(recording.damage)
 
 
 def regions(data: bytes) -> Iterator[tuple[str, int, int]]:
@@ -119,20 +112,16 @@ def silent_changes(path: Path, *, seed: int) -> list[tuple[str, set[str]]]:
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    path = tmp_path / "a.mcap"
-    write(path)
-    return path
+    return write(tmp_path / "a.mcap")
 
 
 @pytest.fixture
 def unsealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recording as it was written before records outside chunks had checksums."""
-    path = tmp_path / "old.mcap"
     with monkeypatch.context() as patched:
         for module in (container, packing):
             patched.setattr(module, "sealed", lambda record: record)
-        write(path)
-    return path
+        return write(tmp_path / "old.mcap")
 
 
 @pytest.mark.long
@@ -228,30 +217,25 @@ def test_damage_in_a_torn_recording_is_noted_too(recording: Path, kind: str) -> 
 
 
 def test_an_index_that_disagrees_with_the_statistics_is_not_believed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Callable[..., Path], pose: Callable[..., Pose]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Callable[..., Path]
 ) -> None:
     real = packing.Gathered.add
 
-    def forgetful(self: Any, channel: int, log_time: int, sequence: int, parts: Any) -> None:
-        real(self, channel, log_time, sequence, parts)
+    def forgetful(self: Any, channel: int, log_time: int, *of_it: Any) -> None:
+        real(self, channel, log_time, *of_it)
         if log_time == 3:
             del self.entries[channel][-2:]
 
     path = record([("a", pose(i)) for i in range(1, 6)], name="whole.mcap")
-    statistics = path.read_bytes()
+    with path.open("rb") as file:
+        statistics = make_reader(file).get_summary().statistics
     with monkeypatch.context() as patched:
         patched.setattr(packing.Gathered, "add", forgetful)
-        patched.setattr(container.ContainerWriter, "_statistics", lambda self: _statistics_of(statistics))
+        patched.setattr(container.ContainerWriter, "_statistics", lambda self: statistics)
         path = record([("a", pose(i)) for i in range(1, 6)])
     with Recording(path) as recording:
         assert "its statistics count 5 messages of channel 1, its index 4" in recording.damage[0]
         assert [m.stamp for m in recording.messages()] == [1, 2, 3, 4, 5]
-
-
-def _statistics_of(data: bytes) -> Any:
-    import io
-
-    return make_reader(io.BytesIO(data)).get_summary().statistics
 
 
 def test_a_seal_tells_every_change_of_its_record() -> None:

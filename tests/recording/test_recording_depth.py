@@ -15,8 +15,8 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from dataflow.messages import DepthImage
 from dataflow.recording import RecordingError
 from dataflow.recording.streams.codecs import codec_for
-from dataflow.recording.streams.foxglove.images import decode_depth
-from dataflow.recording.streams.pixels import as_millimetres
+from dataflow.recording.streams.foxglove.images import decode_raw
+from dataflow.recording.streams.pixels import as_depth, as_millimetres
 
 CODEC = codec_for(DepthImage)
 
@@ -86,4 +86,4 @@ def test_any_millimetres_take_two_bytes(whole: npt.NDArray[np.uint16]) -> None:
 
 def test_another_encoding_is_refused() -> None:
     with pytest.raises(RecordingError, match="'mono16' is no DepthImage; those known are 32FC1, 64FC1, 16UC1"):
-        decode_depth(RawImage(encoding="mono16", width=1, height=1, data=bytes(2)))
+        decode_raw(as_depth, RawImage(encoding="mono16", width=1, height=1, data=bytes(2)))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from made_recordings import pose
 
 from dataflow.messages import Pose
 from dataflow.recording import Recording, RecordingWriter, describe, machine_facts
@@ -14,7 +15,7 @@ from dataflow.recording.layout import FLIGHT
 from dataflow.recording.streams.cutting import triggers_of
 
 
-def test_a_description_counts_rates_sizes_firings_and_metadata(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_a_description_counts_rates_sizes_firings_and_metadata(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={"graph": {"text": "line one\nline two"}}) as writer:
         writer.add_stream("robot/odometry", Pose, extra={"operator": "odometry"})
@@ -35,12 +36,11 @@ def test_a_description_counts_rates_sizes_firings_and_metadata(tmp_path: Path, p
     assert json.loads(json.dumps(found.as_json()))["streams"][1]["name"] == "robot/odometry"
 
 
-def test_a_torn_recording_says_so(tmp_path: Path, record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
+def test_a_torn_recording_is_described_as_torn(record: Callable[..., Path]) -> None:
     path = record([("a", pose(i)) for i in range(1, 9)], chunk_bytes=1)
     path.write_bytes(path.read_bytes()[:-400])
     with Recording(path) as recording:
-        found = describe(recording)
-    assert found.torn
+        assert describe(recording).torn
 
 
 def test_machine_facts_are_text_sorted_and_repeatable() -> None:
@@ -63,5 +63,5 @@ def test_machine_facts_are_text_sorted_and_repeatable() -> None:
         ('[1, {"stamp": 5}]', []),
     ],
 )
-def test_what_a_flight_recorder_kept_says_why(triggers: str, said: list[str]) -> None:
+def test_triggers_of_a_flight_recording_are_read(triggers: str, said: list[str]) -> None:
     assert triggers_of({FLIGHT: {"triggers": triggers}}) == said

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from made_recordings import recorded
 
 from dataflow.messages import FeatureVector, Image
 from dataflow.recording import Recording, RecordingError, RecordingWriter, limits
@@ -69,12 +71,11 @@ def test_a_schema_a_channel_and_metadata_of_the_largest_size_read_back(tmp_path:
     writer.close()
     for content in (path.read_bytes(), path.read_bytes()[:-1]):  # by its summary, and by a pass
         path.write_bytes(content)
-        file = McapFile(path)
-        assert len(file.schemas[1].data) > 9_900
-        assert len(file.channels[1].metadata["k"]) > 9_900
-        assert len(dict(file.metadata)["m"]["k"]) > 9_900
-        assert not file.damage
-        file.close()
+        with closing(McapFile(path)) as file:
+            assert len(file.schemas[1].data) > 9_900
+            assert len(file.channels[1].metadata["k"]) > 9_900
+            assert len(dict(file.metadata)["m"]["k"]) > 9_900
+            assert not file.damage
 
 
 def test_an_attachment_of_the_largest_size_reads_back(tmp_path: Path) -> None:
@@ -98,9 +99,8 @@ def test_a_chunk_ends_with_its_most_messages_so_that_its_index_can_be_read(tmp_p
     writer.close()
     with Recording(path) as recording:
         assert [raw.log_time for raw in recording.raw()] == list(range(120))
-    file = McapFile(path)
-    assert np.bincount(file.index.entries(channel).chunks).tolist() == [50, 50, 20]
-    file.close()
+    with closing(McapFile(path)) as file:
+        assert np.bincount(file.index.entries(channel).chunks).tolist() == [50, 50, 20]
 
 
 def test_a_recording_holds_as_many_metadata_records_as_are_read(tmp_path: Path) -> None:
@@ -113,20 +113,16 @@ def test_a_recording_holds_as_many_metadata_records_as_are_read(tmp_path: Path) 
     writer.close()
     for content in (path.read_bytes(), path.read_bytes()[:-1]):
         path.write_bytes(content)
-        file = McapFile(path)
-        assert len(file.metadata) == LIMITS["MAX_PARSED"]
-        file.close()
+        with closing(McapFile(path)) as file:
+            assert len(file.metadata) == LIMITS["MAX_PARSED"]
 
 
 @pytest.mark.long
 def test_dark_images_beyond_any_ratio_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Volumes, cost maps and dark frames: what together expanded more than 50-fold beyond 768 MiB was refused."""
     monkeypatch.undo()
-    path = tmp_path / "a.mcap"
-    with RecordingWriter(path, metadata={}) as writer:
-        writer.add_stream("g/s/x", Image)
-        for k in range(13):
-            writer.write("g/s/x", Image(stamp=k + 1, frame="c", data=np.zeros((8200, 8200), np.uint8)), seq=k)
+    dark = Image(stamp=1, frame="c", data=np.zeros((8200, 8200), np.uint8))
+    path = recorded(tmp_path / "a.mcap", [("g/s/x", dark.replace(stamp=k + 1)) for k in range(13)])
     assert path.stat().st_size < 100_000
     with Recording(path) as recording:
         assert sum(1 for _ in recording.raw()) == 13

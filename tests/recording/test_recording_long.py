@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from made_recordings import pose
 from mcap.opcode import Opcode
 
 from dataflow.messages import Image, Pose
@@ -18,9 +18,11 @@ from dataflow.recording.mcap.chunks import Column
 from dataflow.recording.mcap.index import McapFile
 
 
-def write(path: Path, pose: Callable[..., Pose]) -> None:
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
     """Streams with and without a companion, a static one, one whose clock jumps back, firing records and events."""
-    with RecordingWriter(path, metadata={}, namespace="r", overwrite=True) as writer:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={}, namespace="r") as writer:
         writer.add_stream("r/mount/out", Pose, static=True)
         writer.write("r/mount/out", pose(5), seq=0)
         for name, kind in (("r/camera/image", Image), ("r/pose/out", Pose), ("r/jump/out", Pose)):
@@ -37,6 +39,7 @@ def write(path: Path, pose: Callable[..., Pose]) -> None:
             if k % 20 == 3:
                 writer.write_event("gap", stamp, {"from": k})
             writer.flush()
+    return path
 
 
 def content(path: Path) -> dict[str, Any]:
@@ -66,13 +69,6 @@ def index_behind(data: bytes, *, chunk: int) -> int:
         number += data[at] == Opcode.CHUNK
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
     return at
-
-
-@pytest.fixture
-def path(tmp_path: Path, pose: Callable[..., Pose]) -> Path:
-    path = tmp_path / "a.mcap"
-    write(path, pose)
-    return path
 
 
 def long(monkeypatch: pytest.MonkeyPatch, step: int = 4) -> None:
@@ -125,34 +121,36 @@ def test_the_number_of_chunks_is_not_limited(path: Path, monkeypatch: pytest.Mon
         assert [m.stamp for m in recording.messages()] == [m[1] for m in expected["messages"]]
 
 
-def test_only_the_chunks_of_a_span_are_looked_up(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    long(monkeypatch)
-    taken: list[int] = []
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The numbers of the chunks whose messages are looked up."""
+    found: list[int] = []
     real = message_index.take_messages
 
     def noting(contents: Any, indexes: Any, numbers: Column, **options: Any) -> None:
-        taken.extend(numbers.tolist())
+        found.extend(numbers.tolist())
         real(contents, indexes, numbers, **options)
 
+    monkeypatch.setattr(message_index, "take_messages", noting)
+    return found
+
+
+def test_only_the_chunks_of_a_span_are_looked_up(path: Path, taken: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    long(monkeypatch)
     with Recording(path) as recording:
-        monkeypatch.setattr(message_index, "take_messages", noting)
+        taken.clear()
         assert len(list(recording.messages(["r/camera/image"], 1200, 1240))) == 5
     assert 5 <= len(set(taken)) < 40  # of 120; many reach over the span, as one stream lags by 400 ns
 
 
-def test_records_that_are_passed_over_are_not_looked_up_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_that_are_passed_over_are_not_looked_up_again(
+    path: Path, taken: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The records of an operator that was restarted often lie in many runs, each of which is read by itself."""
     long(monkeypatch)
-    taken: list[int] = []
-    real = message_index.take_messages
-
-    def noting(contents: Any, indexes: Any, numbers: Column, **options: Any) -> None:
-        taken.extend(numbers.tolist())
-        real(contents, indexes, numbers, **options)
-
     with Recording(path) as recording:
         every = list(recording.firings("pose"))
-        monkeypatch.setattr(message_index, "take_messages", noting)
+        taken.clear()
         assert list(recording.firings("pose", skip=50)) == every[50:]
     assert 10 <= len(taken) <= 14  # of 60
 

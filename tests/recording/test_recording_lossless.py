@@ -15,6 +15,7 @@ import pytest
 from example_messages import example
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_recordings import recorded
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -36,7 +37,7 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages import Path as PathMessage
-from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording import Recording
 from dataflow.recording.layout import DIGESTS
 from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.json_codec import LONG_BYTES, MAX_SAFE_INTEGER
@@ -81,16 +82,12 @@ def through_codec(message: Message) -> Message:
 @pytest.fixture(scope="module")
 def every_type(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, list[Message]]]:
     """One recording that holds several examples of every registered type, and those examples."""
-    path = tmp_path_factory.mktemp("every") / "every_type.mcap"
-    written: dict[str, list[Message]] = {}
-    with RecordingWriter(path, metadata={}) as writer:
-        for name, cls in TYPES.items():
-            stream = f"robot/{name}/out"
-            writer.add_stream(stream, cls)
-            written[stream] = [valid(cls, seed).replace(stamp=10**18 + seed) for seed in range(6)]
-            for seq, message in enumerate(written[stream]):
-                writer.write(stream, message, seq=seq)
-    return path, written
+    written = {
+        f"robot/{name}/out": [valid(cls, seed).replace(stamp=10**18 + seed) for seed in range(6)]
+        for name, cls in TYPES.items()
+    }
+    rows = [(stream, message) for stream, messages in written.items() for message in messages]
+    return recorded(tmp_path_factory.mktemp("every") / "every_type.mcap", rows), written
 
 
 @pytest.mark.parametrize("name", sorted(TYPES))
@@ -105,8 +102,8 @@ def test_every_type_keeps_its_digest_through_a_file(every_type: tuple[Path, dict
     path, written = every_type
     with Recording(path) as recording:
         read: dict[str, list[Message]] = {}
-        for recorded in recording.messages():
-            read.setdefault(recorded.stream, []).append(recorded.message)
+        for found in recording.messages():
+            read.setdefault(found.stream, []).append(found.message)
         assert {s: [m.digest() for m in ms] for s, ms in read.items()} == {
             s: [m.digest() for m in ms] for s, ms in written.items()
         }
@@ -136,7 +133,7 @@ def test_json_keeps_every_bit_of_awkward_values(
     message = Awkward(stamp=5, number=number, count=count, maybe=maybe, words=words, small=small, whole=whole)
     assert through_codec(message).digest() == message.digest()
     [data], _ = codec_for(Awkward).encode(message)
-    jsonschema.validate(json.loads(bytes(data)), json.loads(codec_for(Awkward).schema().data))
+    jsonschema.validate(json.loads(bytes(data)), json.loads(codec_for(Awkward).schema.data))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +181,7 @@ def test_json_schemas_use_one_type_per_property() -> None:
 
     for name, cls in TYPES.items():
         codec = codec_for(cls)
-        for schema in (codec.schema(), codec.companion_schema()):
+        for schema in (codec.schema, codec.companion_schema):
             if schema is not None and schema.encoding == "jsonschema":
                 check(json.loads(schema.data), name)
 
@@ -321,6 +318,6 @@ def test_negative_zero_survives_in_protobuf() -> None:
 
 def test_read_arrays_are_aligned_and_frozen(every_type: tuple[Path, dict[str, list[Message]]]) -> None:
     with Recording(every_type[0]) as recording:
-        for recorded in recording.messages():
-            for data in recorded.message.arrays():
+        for found in recording.messages():
+            for data in found.message.arrays():
                 assert data is None or (data.flags.aligned and not data.flags.writeable and data.flags.c_contiguous)

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from example_messages import example
+from made_recordings import recorded
 
 from dataflow.messages import Message, array, scalar
 from dataflow.messages import base as registry
 from dataflow.messages.declaration import Declaration, GenericMessage, generic_type
-from dataflow.recording import Recording, RecordingWriter, describe
+from dataflow.recording import Recording, describe
 from dataflow.recording.layout import DIGESTS
 from dataflow.recording.streams import writer
 from dataflow.recording.streams.diff import diff
@@ -32,11 +33,7 @@ def messages() -> list[Beacon]:
 
 
 def write(path: Path, made: list[Any]) -> Path:
-    with RecordingWriter(path, metadata={}) as writer:
-        writer.add_stream("lamp/beacon", type(made[0]))
-        for seq, message in enumerate(made):
-            writer.write("lamp/beacon", message, seq=seq)
-    return path
+    return recorded(path, [("lamp/beacon", message) for message in made])
 
 
 @pytest.fixture

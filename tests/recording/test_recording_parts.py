@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from made_recordings import pose
 from mcap.data_stream import ReadDataStream
 from mcap.records import Channel
 from mcap.writer import Writer
@@ -46,21 +46,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_parts_read_as_the_whole(folder: Path) -> None:
     with Recording(KEPT) as expected, Recording(folder) as recording:
         for name, info in expected.streams.items():
-            found = recording.streams[name]
-            assert (found.count, found.first, found.last, found.incarnations) == (
-                info.count,
-                info.first,
-                info.last,
-                info.incarnations,
-            ), name
+            for fact in ("count", "first", "last", "incarnations"):
+                assert getattr(recording.streams[name], fact) == getattr(info, fact), name
         assert recording.digests() == expected.digests()
         names = [name for name, info in expected.streams.items() if not info.static and info.count]
         first = min(info.first or 0 for name, info in expected.streams.items() if name in names)
         last = max(info.last or 0 for name, info in expected.streams.items() if name in names)
         for begin, end in ((first + (last - first) // 3, last - (last - first) // 3), (last - 10**8, None)):
-            assert [(m.stream, m.stamp, m.seq) for m in recording.messages(names, begin, end)] == [
-                (m.stream, m.stamp, m.seq) for m in expected.messages(names, begin, end)
-            ]
+            read = ([(m.stream, m.stamp, m.seq) for m in r.messages(names, begin, end)] for r in (recording, expected))
+            assert next(read) == next(read)
         assert sorted(e.stamp for e in recording.events()) == sorted(e.stamp for e in expected.events())
         assert "dataflow:cut" not in recording.metadata
         assert describe(recording).bytes == sum(part.stat().st_size for part in parts_in(folder))
@@ -168,7 +162,7 @@ def test_what_a_file_declares_is_parsed_once_however_often_it_is_opened(
             assert recording.streams == expected.streams
 
 
-def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_parts_without_what_they_share_follow_each_other(tmp_path: Path) -> None:
     """As a recorder makes them that begins a new file: times go on, and so do numbers and firing records."""
     for part in range(3):
         with RecordingWriter(tmp_path / f"a_{part:03}.mcap", metadata={"note": {"part": str(part)}}) as writer:
@@ -187,7 +181,7 @@ def test_parts_without_what_they_share_follow_each_other(tmp_path: Path, pose: C
     assert parts_in(tmp_path) == []
 
 
-def test_the_storage_that_another_process_is_told_is_the_same() -> None:
+def test_storage_options_survive_json() -> None:
     storage = Storage(Splitting(size=1000, every=60_000_000_000), keep=10**6, on_failure="end", mode=0o640)
 
     assert Storage.from_json(json.loads(json.dumps(storage.to_json()))) == storage

@@ -15,7 +15,8 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, IndexType, Writer
+from made_recordings import foreign, noise, pose, recorded
+from mcap.writer import CompressionType, IndexType
 
 from dataflow.messages import CompressedImage, DepthImage, Image, Pose, Transforms
 from dataflow.messages.digest import StreamDigest
@@ -51,12 +52,7 @@ streams_in_file_order = st.lists(st.tuples(st.sampled_from("abc"), st.integers(1
     end=st.none() | st.integers(0, 1300),
 )
 def test_messages_are_merged_by_stamp_then_stream_whatever_their_order_in_the_file(
-    rows: list[tuple[str, int]],
-    chunk_bytes: int,
-    start: int | None,
-    end: int | None,
-    record: Callable[..., Path],
-    pose: Callable[..., Pose],
+    rows: list[tuple[str, int]], chunk_bytes: int, start: int | None, end: int | None, record: Callable[..., Path]
 ) -> None:
     path = record([(name, pose(stamp)) for name, stamp in rows], chunk_bytes=chunk_bytes)
     expected = [
@@ -67,7 +63,7 @@ def test_messages_are_merged_by_stamp_then_stream_whatever_their_order_in_the_fi
     assert read(path, start=start, end=end) == expected
 
 
-def test_chosen_streams_come_alone_and_in_order(record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
+def test_chosen_streams_come_alone_and_in_order(record: Callable[..., Path]) -> None:
     path = record([("b", pose(1)), ("a", pose(2)), ("c", pose(3)), ("a", pose(4))])
     assert read(path, ["c", "a"]) == [("a", 2), ("c", 3), ("a", 4)]
     assert read(path, []) == []
@@ -76,9 +72,7 @@ def test_chosen_streams_come_alone_and_in_order(record: Callable[..., Path], pos
 
 
 @pytest.mark.parametrize("start", [None, 0, 15, 10**6])
-def test_static_streams_come_first_whatever_the_range(
-    start: int | None, record: Callable[..., Path], pose: Callable[..., Pose]
-) -> None:
+def test_static_streams_come_first_whatever_the_range(start: int | None, record: Callable[..., Path]) -> None:
     rows = [("pose", pose(t)) for t in (10, 20, 30)] + [("mount", pose(25)), ("mount2", pose(0))]
     path = record(rows, static=["mount", "mount2"])
     moving = [("pose", t) for t in (10, 20, 30) if start is None or t >= start]
@@ -86,9 +80,7 @@ def test_static_streams_come_first_whatever_the_range(
     assert read(path, ["mount"], start=start, end=1) == [("mount", 25)]
 
 
-def test_a_clock_that_jumps_back_is_read_incarnation_after_incarnation(
-    tmp_path: Path, pose: Callable[..., Pose]
-) -> None:
+def test_a_clock_that_jumps_back_is_read_incarnation_after_incarnation(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={}) as writer:
         for name in "ab":
@@ -100,7 +92,7 @@ def test_a_clock_that_jumps_back_is_read_incarnation_after_incarnation(
     assert read(path) == [(n, t) for t in (100, 110, 50, 105) for n in "ab"]
 
 
-def test_stream_facts_need_no_decoding(record: Callable[..., Path], noise: Callable[..., Any]) -> None:
+def test_stream_facts_need_no_decoding(record: Callable[..., Path]) -> None:
     images = [Image(stamp=100 * i, frame="c", data=noise(i, 10, 10, 3)) for i in range(1, 8)]
     with Recording(record([("camera/image", m) for m in images], chunk_bytes=700)) as recording:
         info = recording.streams["camera/image"]
@@ -111,9 +103,7 @@ def test_stream_facts_need_no_decoding(record: Callable[..., Path], noise: Calla
     assert not info.declared_otherwise
 
 
-def test_digests_are_over_the_message_digests_in_stream_order(
-    record: Callable[..., Path], pose: Callable[..., Pose]
-) -> None:
+def test_digests_are_over_the_message_digests_in_stream_order(record: Callable[..., Path]) -> None:
     messages = [pose(i, x=i / 3) for i in range(5)]
     expected = StreamDigest()
     for message in messages:
@@ -125,7 +115,7 @@ def test_digests_are_over_the_message_digests_in_stream_order(
 
 
 def test_chunks_that_do_not_stay_in_memory_are_read_again(
-    record: Callable[..., Path], noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    record: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Streams written one after the other: the merge goes to and fro between distant chunks."""
     rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcd" for i in range(12)]
@@ -154,7 +144,7 @@ def unpacked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Chunks, int]]:
 
 
 def test_memory_for_chunks_does_not_grow_with_a_recording(
-    record: Callable[..., Path], noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+    record: Callable[..., Path], unpacked: list[tuple[Chunks, int]]
 ) -> None:
     path = record([("a", Image(stamp=i, frame="a", data=noise(i, 20, 20))) for i in range(100)], chunk_bytes=500)
     with Recording(path) as recording:
@@ -165,7 +155,7 @@ def test_memory_for_chunks_does_not_grow_with_a_recording(
 
 
 def test_chunks_in_use_at_a_time_stay_in_memory(
-    record: Callable[..., Path], noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+    record: Callable[..., Path], unpacked: list[tuple[Chunks, int]]
 ) -> None:
     """Streams written one after the other, together larger than what is kept of what is read once."""
     rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcdef" for i in range(60)]
@@ -177,13 +167,11 @@ def test_chunks_in_use_at_a_time_stay_in_memory(
 
 
 def test_the_parts_of_a_recording_share_the_memory_for_chunks(
-    tmp_path: Path, noise: Callable[..., Any], unpacked: list[tuple[Chunks, int]]
+    tmp_path: Path, unpacked: list[tuple[Chunks, int]]
 ) -> None:
     for part in range(10):
-        with RecordingWriter(tmp_path / f"run_{part:03}.mcap", metadata={}, chunk_bytes=1000) as writer:
-            writer.add_stream("a", Image)
-            for i in range(10 * part, 10 * part + 10):
-                writer.write("a", Image(stamp=i, frame="a", data=noise(i, 20, 20)), seq=i)
+        rows = [("a", Image(stamp=i, frame="a", data=noise(i, 20, 20))) for i in range(10 * part, 10 * part + 10)]
+        recorded(tmp_path / f"run_{part:03}.mcap", rows, chunk_bytes=1000)
     with Recording(tmp_path) as recording:
         assert len(list(recording.messages())) == 100
         assert len({chunks for chunks, _ in unpacked}) == 10
@@ -198,8 +186,7 @@ def test_an_empty_recording_opens(tmp_path: Path) -> None:
     with Recording(path) as recording:
         assert not recording.torn
         assert list(recording.messages()) == []
-        assert recording.streams["a"].count == 0
-        assert recording.streams["a"].first is None
+        assert (recording.streams["a"].count, recording.streams["a"].first) == (0, None)
         assert recording.metadata["graph"] == {"text": ""}
 
 
@@ -218,9 +205,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 @once
 @given(data=st.data())
-def test_a_recording_cut_anywhere_gives_a_prefix(
-    data: st.DataObject, record: Callable[..., Path], pose: Callable[..., Pose]
-) -> None:
+def test_a_recording_cut_anywhere_gives_a_prefix(data: st.DataObject, record: Callable[..., Path]) -> None:
     rows = [(name, pose(10 * i)) for i in range(1, 30) for name in "ab"]
     path = record(rows, chunk_bytes=1000)
     whole = path.read_bytes()
@@ -233,9 +218,7 @@ def test_a_recording_cut_anywhere_gives_a_prefix(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32))
-def test_damage_ends_in_an_error_that_names_the_file_and_in_no_other(
-    seed: int, record: Callable[..., Path], pose: Callable[..., Pose]
-) -> None:
+def test_damage_ends_in_an_error_that_names_the_file_and_in_no_other(seed: int, record: Callable[..., Path]) -> None:
     rng = random.Random(seed)
     written = {(n, i): pose(i, x=i) for i in range(20) for n in "ab"}
     path = record([(n, m) for (n, _), m in written.items()], chunk_bytes=600, compression=rng.choice(["zstd", "none"]))
@@ -267,18 +250,14 @@ def transforms_proto(stamp: int) -> bytes:
     return bytes(proto.SerializeToString())
 
 
-def write_foreign(path: Path, stamps: Sequence[int] = (30, 10, 20, 50, 40), **options: Any) -> None:
+TRANSFORMS = ("foxglove.FrameTransforms", "protobuf", file_descriptor_set(FrameTransforms))
+
+
+def write_foreign(path: Path, stamps: Sequence[int] = (30, 10, 20, 50, 40), **options: Any) -> Path:
     """A file as another program writes it: log times in receiving order, event times within the messages."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=200, **options)
-        writer.start(profile="other", library="other")
-        schema = writer.register_schema("foxglove.FrameTransforms", "protobuf", file_descriptor_set(FrameTransforms))
-        known = writer.register_channel("/tf", "protobuf", schema)
-        unknown = writer.register_channel("/secret", "cbor", 0)
-        for i, stamp in enumerate(stamps):
-            writer.add_message(known, log_time=1000 + i, publish_time=0, data=transforms_proto(stamp))
-            writer.add_message(unknown, log_time=1000 + i, publish_time=0, data=b"?" * i)
-        writer.finish()
+    known = ("/tf", "protobuf", TRANSFORMS, [(1000 + i, transforms_proto(stamp)) for i, stamp in enumerate(stamps)])
+    unknown = ("/secret", "cbor", None, [(1000 + i, b"?" * i) for i in range(len(stamps))])
+    return foreign(path, known, unknown, profile="other", chunk_size=200, **options)
 
 
 @pytest.mark.parametrize(
@@ -296,9 +275,7 @@ def write_foreign(path: Path, stamps: Sequence[int] = (30, 10, 20, 50, 40), **op
     ids=["plain", "lz4", "none", "no chunks", "no index", "no message index", "no repeats", "nothing"],
 )
 def test_foreign_files_are_read_in_the_order_of_their_event_times(options: dict[str, Any], tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
-    write_foreign(path, **options)
-    with Recording(path) as recording:
+    with Recording(write_foreign(tmp_path / "foreign.mcap", **options)) as recording:
         assert not recording.torn
         assert recording.profile == "other"
         assert recording.streams["/tf"].message_type is Transforms
@@ -314,31 +291,19 @@ def test_foreign_files_are_read_in_the_order_of_their_event_times(options: dict[
 
 
 def test_foreign_messages_of_equal_event_times_are_stamped_by_log_time(tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
-    write_foreign(path, stamps=[30, 10, 10])
+    path = write_foreign(tmp_path / "foreign.mcap", stamps=[30, 10, 10])
     assert read(path) == [("/tf", 1000), ("/tf", 1001), ("/tf", 1002)]
 
 
 def test_a_foreign_raw_image_is_an_image_or_a_depth_image_by_its_encoding(tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
     padded = np.arange(2 * 16, dtype=np.uint8).reshape(2, 16)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
-        sizes = {
-            "/rgb": ("rgb8", 5, 2),
-            "/depth": ("32FC1", 3, 2),
-            "/bayer": ("bayer_rggb8", 8, 4),
-            "/odd": ("yv12", 15, 2),
-        }
-        for topic, (encoding, width, height) in sizes.items():
-            step = 32 // height
-            proto = RawImage(width=width, height=height, encoding=encoding, step=step, data=padded.tobytes())
-            channel = writer.register_channel(topic, "protobuf", schema)
-            writer.add_message(channel, log_time=7, publish_time=7, data=proto.SerializeToString())
-        writer.finish()
-    with Recording(path) as recording:
+    schema = ("foxglove.RawImage", "protobuf", file_descriptor_set(RawImage))
+    sizes = {"rgb": ("rgb8", 5, 2), "depth": ("32FC1", 3, 2), "bayer": ("bayer_rggb8", 8, 4), "odd": ("yv12", 15, 2)}
+    topics = []
+    for topic, (encoding, width, height) in sizes.items():
+        image = RawImage(width=width, height=height, encoding=encoding, step=32 // height, data=padded.tobytes())
+        topics.append((f"/{topic}", "protobuf", schema, [(7, image.SerializeToString())]))
+    with Recording(foreign(tmp_path / "foreign.mcap", *topics)) as recording:
         found = {m.stream: m.message for m in recording.messages()}
         assert recording.streams["/odd"].message_type is None
     assert isinstance(found["/bayer"], Image)
@@ -349,7 +314,7 @@ def test_a_foreign_raw_image_is_an_image_or_a_depth_image_by_its_encoding(tmp_pa
     assert found["/rgb"].stamp == 7  # the log time, where the message carries none
 
 
-def test_a_registered_decoder_makes_a_foreign_schema_readable(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_a_registered_decoder_makes_a_foreign_schema_readable(tmp_path: Path) -> None:
     def bind(schema: SchemaText) -> Callable[[bytes, int], Pose]:
         frame = schema.data.decode()
         return lambda data, log_time: build(Pose, log_time, dict(pose(0).items()) | {"frame": frame + data.decode()})
@@ -357,20 +322,14 @@ def test_a_registered_decoder_makes_a_foreign_schema_readable(tmp_path: Path, po
     register_decoder("text", "test.Pose", ForeignDecoder(bind))
     with pytest.raises(RecordingError, match="already"):
         register_decoder("text", "test.Pose", ForeignDecoder(bind))
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/pose", "text", writer.register_schema("test.Pose", "text", b"map"))
-        writer.add_message(channel, log_time=3, publish_time=3, data=b"_2")
-        writer.finish()
-    with Recording(path) as recording:
-        [recorded] = recording.messages()
-    assert (recorded.stamp, recorded.message.frame) == (3, "map_2")
+    topic = ("/pose", "text", ("test.Pose", "text", b"map"), [(3, b"_2")])
+    with Recording(foreign(tmp_path / "foreign.mcap", topic)) as recording:
+        [read] = recording.messages()
+    assert (read.stamp, read.message.frame) == (3, "map_2")
 
 
 def test_a_type_that_is_not_declared_here_is_listed_and_raw(
-    record: Callable[..., Path], pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+    record: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = record([("a", pose(1)), ("b", Image(stamp=2, frame="c", data=[[1]]))])
     import dataflow.recording.streams.streams as streams
@@ -407,23 +366,14 @@ def test_foxglove_json_becomes_our_messages(data_dir: Path) -> None:
 
 
 def test_a_recording_of_a_newer_format_is_refused_with_what_to_do(
-    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "newer.mcap"
     monkeypatch.setattr("dataflow.recording.streams.writer.FORMAT", "2")
-    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
-        writer.add_stream("robot1/a/pose", Pose)
-        writer.write("robot1/a/pose", pose(1), seq=0)
+    path = recorded(tmp_path / "newer.mcap", [("robot1/a/pose", pose(1))], namespace="robot1")
     with pytest.raises(RecordingError, match=r"format '2'.*reads format '1'.*newer"):
         Recording(path)
 
 
 def test_a_file_of_another_program_may_have_metadata_of_that_name(tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("recording", {"format": "7"})
-        writer.finish()
-    with Recording(path) as recording:
+    with Recording(foreign(tmp_path / "foreign.mcap", metadata={"recording": {"format": "7"}})) as recording:
         assert recording.metadata["recording"] == {"format": "7"}

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from made_recordings import noise, pose
 from mcap.reader import make_reader
 
 from dataflow.messages import Image, Pose
@@ -63,7 +64,7 @@ def test_a_killed_writer_leaves_everything_up_to_the_last_chunk(tmp_path: Path) 
         assert all(m.message.child_frame == "camera" for m in poses)
 
 
-def test_flushed_messages_are_readable_while_the_writer_lives(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_flushed_messages_are_readable_while_the_writer_lives(tmp_path: Path) -> None:
     path = tmp_path / "live.mcap"
     with RecordingWriter(path, metadata={}) as writer:
         writer.add_stream("a", Pose)
@@ -78,7 +79,7 @@ def test_flushed_messages_are_readable_while_the_writer_lives(tmp_path: Path, po
         assert [m.stamp for m in recording.messages()] == [1, 2]
 
 
-def test_an_old_chunk_is_finished_by_the_next_message(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_an_old_chunk_is_finished_by_the_next_message(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "slow.mcap", metadata={}, chunk_seconds=0.0) as writer:
         writer.add_stream("a", Pose)
         writer.write("a", pose(1), seq=0)
@@ -87,7 +88,7 @@ def test_an_old_chunk_is_finished_by_the_next_message(tmp_path: Path, pose: Call
         assert writer.saved_bytes > before
 
 
-def record_until_it_fails(path: Path, noise: Callable[..., Any], limit: int = 1000) -> tuple[RecordingError, int]:
+def record_until_it_fails(path: Path, limit: int = 1000) -> tuple[RecordingError, int]:
     """Writes images until the writer raises; the error, and how many messages it had taken before."""
     writer = RecordingWriter(path, metadata={}, chunk_bytes=50_000)
     writer.add_stream("camera/image", Image)
@@ -95,20 +96,16 @@ def record_until_it_fails(path: Path, noise: Callable[..., Any], limit: int = 10
         for seq in range(limit):
             writer.write("camera/image", Image(stamp=seq, frame="c", data=noise(seq, 64, 64, 3)), seq=seq)
     except RecordingError as error:
-        with pytest.raises(RecordingError, match="failed"):
-            writer.write("camera/image", Image(stamp=limit, frame="c", data=noise(0, 8, 8)), seq=limit)
-        with pytest.raises(RecordingError, match="failed"):
-            writer.flush()
-        with pytest.raises(RecordingError, match="failed"):
-            writer.close()
+        more = Image(stamp=limit, frame="c", data=noise(0, 8, 8))
+        for refused in (lambda: writer.write("camera/image", more, seq=limit), writer.flush, writer.close):
+            with pytest.raises(RecordingError, match="failed"):
+                refused()
         writer.close()
         return error, seq
     raise AssertionError("the disk was never full")
 
 
-def test_a_full_disk_is_reported_and_leaves_a_readable_file(
-    tmp_path: Path, noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_reported_and_leaves_a_readable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real, room = os.write, 400_000
 
     def write(fd: int, data: Any) -> int:
@@ -121,7 +118,7 @@ def test_a_full_disk_is_reported_and_leaves_a_readable_file(
 
     monkeypatch.setattr(os, "write", write)
     path = tmp_path / "full.mcap"
-    error, taken = record_until_it_fails(path, noise)
+    error, taken = record_until_it_fails(path)
     assert "No space left on device" in str(error)
     assert str(path) in str(error)
     with Recording(path) as recording:
@@ -133,21 +130,29 @@ def test_a_full_disk_is_reported_and_leaves_a_readable_file(
     assert f"stamps up to {seqs[-1]}" in str(error)
 
 
-def test_the_end_of_a_file_is_one_write(
-    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A disk that takes a tenth of a second for each would hold up a recorder for seconds."""
+def noted_writes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     real, writes = os.write, list[int]()
+    monkeypatch.setattr(os, "write", lambda fd, data: (writes.append(len(data)), real(fd, data))[1])
+    return writes
 
-    def write(fd: int, data: Any) -> int:
-        writes.append(len(data))
-        return real(fd, data)
 
+def refuse_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.write
+
+    def refuse(fd: int, data: Any) -> int:
+        monkeypatch.setattr(os, "write", real)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", refuse)
+
+
+def test_the_end_of_a_file_is_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that takes a tenth of a second for each would hold up a recorder for seconds."""
     writer = RecordingWriter(tmp_path / "many.mcap", metadata={})
     for k in range(40):
         writer.add_stream(f"a{k}", Pose)
         writer.write(f"a{k}", pose(1), seq=0)
-    monkeypatch.setattr(os, "write", write)
+    writes = noted_writes(monkeypatch)
     writer.flush()
     assert len(writes) == 1
     writer.close()
@@ -158,16 +163,10 @@ def test_the_end_of_a_file_is_one_write(
 
 
 def test_what_a_file_declares_goes_to_the_disk_with_its_first_messages_in_one_write(
-    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a write for each schema, channel and metadata, a part of a recording began with forty."""
-    real, writes = os.write, list[int]()
-
-    def write(fd: int, data: Any) -> int:
-        writes.append(len(data))
-        return real(fd, data)
-
-    monkeypatch.setattr(os, "write", write)
+    writes = noted_writes(monkeypatch)
     writer = RecordingWriter(tmp_path / "many.mcap", metadata={"graph": {"text": "graph: g"}})
     for k in range(12):
         writer.add_stream(f"a{k}", Pose)
@@ -183,14 +182,8 @@ def test_what_a_file_declares_goes_to_the_disk_with_its_first_messages_in_one_wr
 
 
 def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
-    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = os.write
-
-    def refuse(fd: int, data: Any) -> int:
-        monkeypatch.setattr(os, "write", real)
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     path = tmp_path / "full.mcap"
     writer = RecordingWriter(path, metadata={"graph": {"text": "graph: g"}})
     writer.add_stream("kept", Pose)
@@ -199,7 +192,7 @@ def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
     writer.add_stream("lost", Pose)
     writer.add_metadata("later", {"a": "b"})
     writer.write("lost", pose(1), seq=0)
-    monkeypatch.setattr(os, "write", refuse)
+    refuse_once(monkeypatch)
     with pytest.raises(RecordingError, match="No space left"):
         writer.flush()
     with pytest.raises(RecordingError, match="No space left"):
@@ -212,21 +205,13 @@ def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
         assert recording.metadata["graph"] == {"text": "graph: g"}
 
 
-def test_a_disk_without_room_for_the_digests_leaves_an_index(
-    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = os.write
-
-    def refuse(fd: int, data: Any) -> int:
-        monkeypatch.setattr(os, "write", real)
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+def test_a_disk_without_room_for_the_digests_leaves_an_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "full.mcap"
     writer = RecordingWriter(path, metadata={})
     writer.add_stream("kept", Pose)
     writer.write("kept", pose(1), seq=0)
     writer.flush()
-    monkeypatch.setattr(os, "write", refuse)
+    refuse_once(monkeypatch)
     with pytest.raises(RecordingError, match="No space left"):
         writer.close()
 
@@ -235,14 +220,14 @@ def test_a_disk_without_room_for_the_digests_leaves_an_index(
         assert len(list(recording.messages())) == 1
 
 
-def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path, noise: Callable[..., Any]) -> None:
+def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path) -> None:
     """A real refusal by the kernel; cutting the torn chunk off makes room for the index."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     path = tmp_path / "limited.mcap"
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))
     try:
-        error, taken = record_until_it_fails(path, noise)
+        error, taken = record_until_it_fails(path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, handler)
@@ -272,12 +257,12 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
 
 def test_unknown_compression_is_refused_before_a_file_is_made(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="known: zstd, lz4, none"):
-        RecordingWriter(tmp_path / "a.mcap", metadata={}, compression="gzip")  # type: ignore[arg-type]
+        RecordingWriter(tmp_path / "a.mcap", metadata={}, compression="gzip")
     assert not (tmp_path / "a.mcap").exists()
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_every_compression_reads_back(compression: Any, record: Callable[..., Path], noise: Callable[..., Any]) -> None:
+def test_every_compression_reads_back(compression: Any, record: Callable[..., Path]) -> None:
     images = [Image(stamp=i, frame="c", data=noise(i, 40, 40)) for i in range(20)]
     path = record([("a", m) for m in images], compression=compression, chunk_bytes=5000)
     with Recording(path) as recording:
@@ -287,29 +272,29 @@ def test_every_compression_reads_back(compression: Any, record: Callable[..., Pa
 @pytest.mark.parametrize(
     ("message", "seq", "incarnation", "complaint"),
     [
-        (lambda pose: pose(-1), 5, 0, "before the epoch"),
-        (lambda pose: pose(10), 5, 0, "must increase"),  # the stamp of the message before
-        (lambda pose: pose(11), 4, 0, "must increase"),  # its number
-        (lambda pose: pose(11), -1, 1, "must be ≥ 0"),
-        (lambda pose: Image(stamp=11, frame="c", data=[[0]]), 5, 0, "holds Pose, got Image"),
+        (pose(-1), 5, 0, "before the epoch"),
+        (pose(10), 5, 0, "must increase"),  # the stamp of the message before
+        (pose(11), 4, 0, "must increase"),  # its number
+        (pose(11), -1, 1, "must be ≥ 0"),
+        (Image(stamp=11, frame="c", data=[[0]]), 5, 0, "holds Pose, got Image"),
     ],
     ids=["negative stamp", "same stamp", "same number", "negative number", "another type"],
 )
 def test_refused_messages_are_named_and_leave_the_recording_usable(
-    message: Any, seq: int, incarnation: int, complaint: str, tmp_path: Path, pose: Callable[..., Pose]
+    message: Any, seq: int, incarnation: int, complaint: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={}) as writer:
         writer.add_stream("odometry/pose", Pose)
         writer.write("odometry/pose", pose(10), seq=4)
         with pytest.raises(RecordingError, match=complaint):
-            writer.write("odometry/pose", message(pose), seq=seq, incarnation=incarnation)
+            writer.write("odometry/pose", message, seq=seq, incarnation=incarnation)
         writer.write("odometry/pose", pose(12), seq=5)
     with Recording(path) as recording:
         assert [(m.seq, m.stamp) for m in recording.messages()] == [(4, 10), (5, 12)]
 
 
-def test_undeclared_and_twice_declared_streams_are_refused(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_undeclared_and_twice_declared_streams_are_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", metadata={}) as writer:
         writer.add_stream("a", Pose)
         with pytest.raises(RecordingError, match="declared twice"):
@@ -320,7 +305,7 @@ def test_undeclared_and_twice_declared_streams_are_refused(tmp_path: Path, pose:
             writer.add_stream("c", Pose, extra={"kind": "mine"})
 
 
-def test_incarnations_and_long_sequences_keep_their_numbers(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_incarnations_and_long_sequences_keep_their_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     rows = [(2**32 - 1, 0, 5), (2**32, 0, 6), (2**33 + 3, 0, 7), (0, 2, 1), (1, 2, 2)]
     with RecordingWriter(path, metadata={}) as writer:
@@ -334,7 +319,7 @@ def test_incarnations_and_long_sequences_keep_their_numbers(tmp_path: Path, pose
         assert recording.streams["a"].incarnations == 2
 
 
-def test_firings_events_and_metadata_come_back(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_firings_events_and_metadata_come_back(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={"graph": {"text": "graph: g", "name": "g"}}, namespace="robot1") as writer:
         writer.add_stream("robot1/a/pose", Pose)
@@ -363,7 +348,7 @@ def test_firings_events_and_metadata_come_back(tmp_path: Path, pose: Callable[..
     assert topics == {"robot1/a/pose", "robot1/@/firings/a", "robot1/@/firings/b", "robot1/@/events"}
 
 
-def test_firing_records_and_events_lie_apart_from_the_messages(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_firing_records_and_events_lie_apart_from_the_messages(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={}, chunk_bytes=500) as writer:
         writer.add_stream("a/out/pose", Pose)
@@ -390,9 +375,7 @@ def test_firing_records_and_events_lie_apart_from_the_messages(tmp_path: Path, p
             list(recording.messages())
 
 
-def test_a_recording_cut_anywhere_holds_no_message_without_the_record_before_it(
-    tmp_path: Path, pose: Callable[..., Pose]
-) -> None:
+def test_a_recording_cut_anywhere_holds_no_message_without_the_record_before_it(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={}, chunk_bytes=600) as writer:
         writer.add_stream("a/out/pose", Pose)
@@ -410,9 +393,7 @@ def test_a_recording_cut_anywhere_holds_no_message_without_the_record_before_it(
         assert len(messages) <= len(records)
 
 
-def test_a_message_that_readers_would_refuse_is_refused(
-    tmp_path: Path, noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_message_that_readers_would_refuse_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(container, "MAX_CHUNK_BYTES", 10_000)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, metadata={}) as writer:
@@ -428,12 +409,12 @@ def test_a_message_that_readers_would_refuse_is_refused(
         assert max(index.uncompressed_size for index in make_reader(file).get_summary().chunk_indexes) <= 10_000
 
 
-def test_the_same_calls_write_the_same_bytes(record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
+def test_the_same_calls_write_the_same_bytes(record: Callable[..., Path]) -> None:
     rows = [("a", pose(i)) for i in range(5)]
     assert record(rows, name="one.mcap").read_bytes() == record(rows, name="two.mcap").read_bytes()
 
 
-def test_close_is_idempotent_and_ends_writing(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_close_is_idempotent_and_ends_writing(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", metadata={})
     writer.add_stream("a", Pose)
     writer.close()
@@ -443,7 +424,7 @@ def test_close_is_idempotent_and_ends_writing(tmp_path: Path, pose: Callable[...
 
 
 @pytest.mark.long
-def test_the_index_of_a_long_run_takes_no_more_memory_than_its_bytes(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+def test_the_index_of_a_long_run_takes_no_more_memory_than_its_bytes(tmp_path: Path) -> None:
     streams = [f"s/{i}" for i in range(20)]
 
     def chunks(writer: RecordingWriter, first: int, count: int) -> None:

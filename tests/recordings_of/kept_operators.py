@@ -120,7 +120,7 @@ class Smooth(Operator, every="70ms"):
     def setup(self) -> None:
         self.state, self.calls = 0.0, 0
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         self.calls += 1
         if x is not None:
             self.state += self.weight * (float(x.vectors[0, 0]) - self.state)

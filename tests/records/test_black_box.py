@@ -21,7 +21,7 @@ PORTS = {"camera": ("image", "info"), "detector": ("boxes",)}
 def record(index: int, operator: str = "camera", *, size: int = 0, kind: str = "fire") -> FiringRecord:
     outputs = (Emission(index, 100 + index, bytes(16)), *(None for _ in PORTS[operator][1:]))
     detail = {"name": "gain", "value": index} if kind == "param" else {"state": bytes(size)}
-    return FiringRecord(operator, 0, index, kind, 100 + index, outputs=outputs, detail=detail)  # type: ignore[arg-type]
+    return FiringRecord(operator, 0, index, kind, 100 + index, outputs=outputs, detail=detail)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def kept(memory: int, operator: str) -> list[int]:
     return [decode_batch(data).records[0].index for data in read_black_box(memory, PORTS).batches[operator]]
 
 
-def test_a_box_that_nobody_wrote_to_holds_nothing(memory: int) -> None:
+def test_a_new_black_box_is_empty(memory: int) -> None:
     assert read_black_box(memory, PORTS).reached == {"camera": Reached(), "detector": Reached()}
 
 

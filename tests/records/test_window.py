@@ -99,7 +99,7 @@ def test_the_window_has_what_is_needed_or_all_is_read(
     options: dict[str, int], first: int | None, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.mcap"
-    write(path, **options)  # type: ignore[arg-type]
+    write(path, **options)
     with log_of(path) as log:
         kept, lost = whole(log.of("op"))
         assert not lost

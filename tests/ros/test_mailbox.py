@@ -52,12 +52,8 @@ def test_what_does_not_fit_is_not_lost_on_the_side_of_ros(monkeypatch: pytest.Mo
     for number in (5, 8):
         box.sample(b"", sent(number).encoded())
     came += [box.get(0.0), box.get(0.0)]
-    assert [(c.seen.number, c.missing, c.lost) for c in came if isinstance(c, Arrival) and c.seen] == [
-        (1, 0, 0),
-        (2, 0, 0),
-        (5, 0, 0),
-        (8, 2, 2),
-    ]
+    found = [(c.seen.number, c.missing, c.lost) for c in came if isinstance(c, Arrival) and c.seen]
+    assert found == [(1, 0, 0), (2, 0, 0), (5, 0, 0), (8, 2, 2)]
     assert (box.overflow, box.losses.lost) == (2, 2)
 
 

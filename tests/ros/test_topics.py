@@ -12,11 +12,11 @@ import numpy as np
 import psutil
 import pytest
 import zenoh.ext
-from ros_peer import HUMBLE, JAZZY, STRING, Peer, ros, router, string, until
+from ros_peer import HUMBLE, JAZZY, STRING, Peer, Read, ros, router, string, until
 
 import dataflow.ros as topics
 from dataflow.graph import GraphError, load_text
-from dataflow.messages import CameraInfo, Image, Message, Text, Twist
+from dataflow.messages import CameraInfo, Image, Text, Twist
 from dataflow.operator import FINDING, SourceError
 from dataflow.recording import Recording
 from dataflow.ros import source as source_module
@@ -45,33 +45,11 @@ def peer(endpoint: str) -> Iterator[Peer]:
         yield found
 
 
-class Read:
-    """A source that is read on a thread, as in a live run."""
-
-    def __init__(self, name: str, peer: Peer, **params: Any) -> None:
-        self.source = getattr(topics, name)(router=peer.endpoint, **params)
-        self.source.setup()
-        node = self.source._node.node
-        until(lambda: peer.tokens(f"@ros2_lv/0/{node.session}/*/*/MS/**"))  # what is sent now comes
-        self.steps: list[dict[str, Message]] = []
-        self.thread = threading.Thread(target=self._read)
-        self.thread.start()
-
-    def _read(self) -> None:
-        for step in self.source.stream():
-            self.steps.append(step)
-
-    @property
-    def texts(self) -> list[str]:
-        return [step["message"].text for step in self.steps]
-
-    def __enter__(self) -> Read:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.source.stop_reading()
-        self.thread.join(10)
-        self.source.close()
+def read(name: str, peer: Peer, **params: Any) -> Read:
+    """A source of a topic, once what is sent comes."""
+    found = Read(getattr(topics, name)(router=peer.endpoint, **params))
+    until(lambda: peer.tokens(f"@ros2_lv/0/{found.source._node.node.session}/*/*/MS/**"))
+    return found
 
 
 def header(nanoseconds: int, frame: str = "camera") -> Any:
@@ -81,68 +59,58 @@ def header(nanoseconds: int, frame: str = "camera") -> Any:
 
 
 def transform(child: str, stamp: int = 5 * 10**9) -> Any:
-    vector, turn = (
-        ros("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0),
-        ros("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-    )
+    vector = ros("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)
+    turn = ros("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     place = ros("geometry_msgs/msg/Transform", translation=vector, rotation=turn)
     row = ros("geometry_msgs/msg/TransformStamped", header=header(stamp, "base"), child_frame_id=child, transform=place)
     return ros(TF, transforms=[row])
 
 
 def image(stamp: int, value: int) -> Any:
-    return ros(
-        IMAGE,
-        header=header(stamp),
-        height=48,
-        width=64,
-        encoding="rgb8",
-        is_bigendian=0,
-        step=192,
-        data=np.full(48 * 192, value, np.uint8),
-    )
+    rows = {"encoding": "rgb8", "is_bigendian": 0, "step": 192, "data": np.full(48 * 192, value, np.uint8)}
+    return ros(IMAGE, header=header(stamp), height=48, width=64, **rows)
 
 
 def test_messages_come_in_order_and_every_loss_is_counted(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
-    with Read("Text", peer, topic="chatter") as read:
+    with read("Text", peer, topic="chatter") as reading:
         for text in "ab":
             talker.send(string(text))
         talker.number += 3
         talker.send(string("f"))
-        until(lambda: len(read.steps) == 3)
+        until(lambda: len(reading.steps) == 3)
         other = peer.publisher("/chatter", "std_msgs/msg/String", STRING)  # it was started anew
         other.send(string("g"))
-        until(lambda: len(read.steps) == 4)
-    assert read.texts == ["a", "b", "f", "g"]
-    assert [(step["lost"].value, step["message"].text) for step in read.steps if "lost" in step] == [(3, "f")]
-    summary = read.source.summary()
+        until(lambda: len(reading.steps) == 4)
+    assert reading.texts == ["a", "b", "f", "g"]
+    assert [(step["lost"].value, step["message"].text) for step in reading.steps if "lost" in step] == [(3, "f")]
+    summary = reading.source.summary()
     assert (summary["lost"], summary["received"], summary["overflow"]) == (3, 4, 0)
-    assert read.source.finding() == "/chatter: lost are 3 of 6 messages of /talker"
+    assert reading.source.finding() == "/chatter: lost are 3 of 6 messages of /talker"
 
 
 def test_a_publisher_of_another_distribution_is_named(
     endpoint: str, peer: Peer, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with Read("Text", peer, topic="/chatter", type="std_msgs/msg/String", distro="kilted") as read:
+    with read("Text", peer, topic="/chatter", type="std_msgs/msg/String", distro="kilted") as reading:
         old = peer.publisher("/chatter", "std_msgs/msg/String", HUMBLE)
         numbers = peer.publisher("/chatter", "std_msgs/msg/Float64", JAZZY.hash_rihs01("std_msgs/msg/Float64"))
         old.send(string("unheard"))
-        until(lambda: read.source.summary().get("mismatched") == 2)
+        until(lambda: reading.source.summary().get("mismatched") == 2)
     said = caplog.text
     assert "/talker publishes std_msgs/msg/String as defined by humble (TypeHashNotSupported)" in said
     assert "/talker publishes std_msgs/msg/Float64, and std_msgs/msg/String is taken" in said
-    assert "as defined by humble" in read.source.finding()
-    assert not read.steps
+    assert "as defined by humble" in reading.source.finding()
+    assert not reading.steps
     assert numbers.number == 0
 
 
 @pytest.mark.parametrize("hash_", [HUMBLE, STRING])
 def test_type_and_distribution_are_those_of_the_publisher_unless_given(endpoint: str, peer: Peer, hash_: str) -> None:
     talker = peer.publisher("/found", "std_msgs/msg/String", hash_)
-    with Read("Text", peer, topic="/found") as read:
+    with read("Text", peer, topic="/found") as reading:
         talker.send(string("heard"))
-        until(lambda: read.texts == ["heard"])
+        until(lambda: reading.texts == ["heard"])
 
 
 def test_types_without_a_counterpart_are_passed_on_as_they_are(endpoint: str, peer: Peer) -> None:
@@ -152,10 +120,10 @@ def test_types_without_a_counterpart_are_passed_on_as_they_are(endpoint: str, pe
     came = peer.heard(key)
     sink = Ros2Sink(topic="/again", router=endpoint)
     sink.setup()
-    with Read("Ros2Source", peer, topic="/gripper") as read:
+    with read("Ros2Source", peer, topic="/gripper") as reading:
         talker.send(b"\0\1\0\0abc")
-        until(lambda: len(read.steps) == 1)
-    got = read.steps[0]["message"]
+        until(lambda: len(reading.steps) == 1)
+    got = reading.steps[0]["message"]
     assert (got.type, got.hash, got.data.tobytes()) == ("my_robot/msg/Gripper", own, b"\0\1\0\0abc")
     sink.process(got, None)
     until(lambda: peer.tokens("@ros2_lv/0/*/*/*/MP/*/*/*/%again/**"))
@@ -216,45 +184,42 @@ def test_a_command_goes_out_as_the_type_that_the_robot_takes(endpoint: str, peer
 def test_messages_without_a_header_are_stamped_by_the_clock_of_ros(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/simulated", "std_msgs/msg/String", STRING)
     clock = peer.publisher("/clock", "rosgraph_msgs/msg/Clock", JAZZY.hash_rihs01("rosgraph_msgs/msg/Clock"))
-    with Read("Text", peer, topic="/simulated", sim_time=True) as read:
+    with read("Text", peer, topic="/simulated", sim_time=True) as reading:
         talker.send(string("before"))
-        until(lambda: read.source.summary().get("before_clock") == 1)
+        until(lambda: reading.source.summary().get("before_clock") == 1)
         for second in (7, 8):
             clock.send(ros("rosgraph_msgs/msg/Clock", clock=ros("builtin_interfaces/msg/Time", sec=second, nanosec=1)))
-            until(lambda second=second: read.source._mail.clock == second * 10**9 + 1)
+            until(lambda second=second: reading.source._mail.clock == second * 10**9 + 1)
             for _ in range(3):
                 talker.send(string("after"))
-            until(lambda second=second: len(read.steps) == 3 * (second - 6))
+            until(lambda second=second: len(reading.steps) == 3 * (second - 6))
         clock.send(b"\0\1")
-        until(lambda: read.source.summary().get("unreadable") == 1)
-    assert [step["message"].stamp for step in read.steps] == [
+        until(lambda: reading.source.summary().get("unreadable") == 1)
+    assert [step["message"].stamp for step in reading.steps] == [
         second * 10**9 + k for second in (7, 8) for k in (1, 2, 3)
     ]
-    assert read.source.summary()["late"] == 0
-    assert read.source.finding().startswith("/clock: a rosgraph_msgs/msg/Clock of 2 bytes is too short")
+    assert reading.source.summary()["late"] == 0
+    assert reading.source.finding().startswith("/clock: a rosgraph_msgs/msg/Clock of 2 bytes is too short")
 
 
 def test_a_message_that_cannot_be_read_is_counted_with_its_reason(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/broken", "sensor_msgs/msg/Imu", JAZZY.hash_rihs01("sensor_msgs/msg/Imu"))
-    with Read("Imu", peer, topic="/broken") as read:
+    with read("Imu", peer, topic="/broken") as reading:
         talker.send(b"\0\1\0\0\1")
-        until(lambda: read.source.summary().get("unreadable") == 1)
-    assert "sensor_msgs/msg/Imu" in read.source.finding()
+        until(lambda: reading.source.summary().get("unreadable") == 1)
+    assert "sensor_msgs/msg/Imu" in reading.source.finding()
 
 
 def test_the_number_of_losses_comes_again_since_a_step_may_be_refused(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
-    with Read("Text", peer, topic="/chatter", type="std_msgs/msg/String") as read:
+    with read("Text", peer, topic="/chatter", type="std_msgs/msg/String") as reading:
         talker.send(string("0"))
         talker.number += 3
         for text in range(1, 50):
             talker.send(string(str(text)))
-        until(lambda: len(read.steps) == 50)
-    assert [(step["message"].text, step["lost"].value) for step in read.steps if "lost" in step] == [
-        ("1", 3),
-        ("21", 3),
-        ("41", 3),
-    ]
+        until(lambda: len(reading.steps) == 50)
+    found = [(step["message"].text, step["lost"].value) for step in reading.steps if "lost" in step]
+    assert found == [("1", 3), ("21", 3), ("41", 3)]
 
 
 def test_definitions_are_read_before_messages_come(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from ros_peer import router, until
+from ros_peer import Read, router, until
 
 import dataflow.ros as topics
 from dataflow.interop.ros import CONVERSIONS
@@ -53,28 +52,6 @@ def endpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
             ZenohSession._instance.close()
 
 
-class Read:
-    """A source that is read on a thread."""
-
-    def __init__(self, source: Any) -> None:
-        self.source, self.steps = source, list[Any]()
-        source.setup()
-        self.thread = threading.Thread(target=self._read)
-        self.thread.start()
-
-    def _read(self) -> None:
-        for step in self.source.stream():
-            self.steps.append(step)
-
-    def __enter__(self) -> Read:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.source.stop_reading()
-        self.thread.join(10)
-        self.source.close()
-
-
 @pytest.mark.parametrize("distro", DISTROS)
 def test_type_hashes_are_those_of_another_implementation(distro: Any) -> None:
     from zenoh_ros2_sdk.utils import get_type_hash
@@ -96,7 +73,7 @@ def test_what_the_other_side_publishes_comes_and_its_losses_are_counted(endpoint
         talker.sequence_number += 3
         talker.publish(data="f")
         until(lambda: len(read.steps) == 3)
-        assert [step["message"].text for step in read.steps] == ["a", "b", "f"]
+        assert read.texts == ["a", "b", "f"]
         assert (read.source.summary()["lost"], read.source.summary()["received"]) == (3, 3)
     talker.close()
 

@@ -73,7 +73,7 @@ class Fallback(Operator):
     other: Sampled[FeatureVector] = Sampled(required=False)
     y: Out[FeatureVector]
 
-    def process(self, x: FeatureVector, other: FeatureVector | None, context) -> FeatureVector:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector, other: FeatureVector | None, context) -> FeatureVector:
         return value(x.stamp, float("other" in context.stale), -1.0 if other is None else number(other))
 
 

@@ -130,7 +130,7 @@ class Smooth(Operator, every="25ms"):
     def setup(self) -> None:
         self.state, self.calls = 0.0, 0
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         nap(self.sleep)
         self.calls += 1
         if x is not None:
@@ -204,7 +204,7 @@ class Broken(Operator):
                 case "stamp":
                     return value(x.stamp - 1, 0.0)
                 case "type":
-                    return "nothing"  # type: ignore[return-value]
+                    return "nothing"
                 case "mutate":
                     x.vectors.flags.writeable = True
                     x.vectors[0, 0] += 1
@@ -234,7 +234,7 @@ class LookAhead(Operator, tolerance="100s"):
 class SmoothChanged(Smooth):
     """`Smooth` after somebody changed its arithmetic, in a way that shows late and only here."""
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         made = super().process(x, context)
         if made is not None and self.calls > 40:
             made = value(made.stamp, number(made) + 1e-3)
@@ -281,7 +281,7 @@ class TunedByConstant(Tuned):
 
     constant: Sampled[FeatureVector]
 
-    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:  # type: ignore[override]
+    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:
         made = super().process(x)
         return value(made.stamp, number(made) * number(constant))
 

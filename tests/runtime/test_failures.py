@@ -34,7 +34,7 @@ def broken(how: str) -> Graph:
 
 def fails(graph: Graph, **options: object) -> RunFailed:
     with pytest.raises(RunFailed) as caught:
-        Supervisor(RunPlan(graph, **options)).run()  # type: ignore[arg-type]
+        Supervisor(RunPlan(graph, **options)).run()
     return caught.value
 
 
@@ -69,7 +69,7 @@ def test_an_operator_that_exits_is_named_as_one_that_raises() -> None:
     assert "in fire at stamp 1200000000: SystemExit: enough" in str(failure)
 
 
-def test_what_operators_start_ends_with_their_process_and_holds_nobody_up() -> None:
+def test_children_of_operators_end_with_their_process() -> None:
     lines: list[str] = []
 
     Supervisor(RunPlan(broken("children")), on_output=lambda label, line: lines.append(line)).run()
@@ -119,7 +119,7 @@ def test_a_process_that_dies_is_named_with_the_signal_and_how_far_it_was() -> No
 
 
 @pytest.mark.long
-def test_a_run_whose_nursery_is_killed_says_so_and_leaves_no_process(tmp_path: Path) -> None:
+def test_killed_nursery_fails_the_run_and_leaves_no_process(tmp_path: Path) -> None:
     graph = chain(
         "bad: {use: runtime_operators:Broken, params: {how: children}, inputs: {x: left/fast}}",
         "sum: {use: runtime_operators:Sum, inputs: {x: bad/y}}",
@@ -164,7 +164,7 @@ def test_a_fault_in_native_code_ends_the_run_with_the_line_that_called_it() -> N
     assert re.search(r'runtime_operators.py", line \d+ in process', failure.details), failure.details
 
 
-def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
+def test_failure_leaves_a_recording_with_its_outcome(tmp_path: Path) -> None:
     path = tmp_path / "failed.mcap"
 
     fails(broken("raise"), record=path, placement="process_each")

@@ -247,7 +247,7 @@ def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path
 
 
 @pytest.mark.long
-def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> None:
+def test_slow_operator_drops_by_policy_without_delaying_others(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
         "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
@@ -405,7 +405,7 @@ def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stamp_in_the_past_is_dropped_and_a_malformed_message_from_outside_reaches_nobody(path: Path) -> None:
+def test_past_stamps_and_malformed_outside_messages_are_dropped(path: Path) -> None:
     past = {"kind": "past", "operator": "left", "by": "200ms", "every": "200ms"}
 
     ran = Ran(robot(SMOOTH), path, past, {"kind": "malformed", "operator": "left", "at": "300ms"})

@@ -41,7 +41,7 @@ def flown(tmp_path: Path, **options: Any) -> Any:
 
 
 @pytest.mark.long
-def test_what_somebody_asks_for_is_kept_and_verifies(tmp_path: Path) -> None:
+def test_triggered_recording_is_kept_and_verifies(tmp_path: Path) -> None:
     asked: list[str] = []
 
     def ask() -> None:

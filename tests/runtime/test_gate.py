@@ -13,15 +13,7 @@ from dataflow.records.comparison import Difference, Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.gate import (
-    Baseline,
-    BaselineError,
-    Checked,
-    Judged,
-    check,
-    judge,
-    recordings_in,
-)
+from dataflow.verification.gate import Baseline, BaselineError, Checked, Judged, check, judge, recordings_in
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.stored import StoredStream
 
@@ -148,7 +140,7 @@ def test_the_verdict_is_that_of_the_first_row_of_the_table_that_applies() -> Non
         [row, *_] = [row for row in table() if applies(row, case)]
         expected = made if row[3] == "identical, within tolerance" else row[3]
         expected = "identical" if expected == "as recorded" else expected
-        found = next(j.verdict for j in judge(outcome, baseline) if j.operator == "b")  # type: ignore[arg-type]
+        found = next(j.verdict for j in judge(outcome, baseline) if j.operator == "b")
 
         assert found == expected, (case, row)
         met.add(row)
@@ -159,15 +151,15 @@ def test_what_was_accepted_passes_and_only_that() -> None:
     known = accepted({"a": None, "b": "x", "c": "y"})
     same = report({"a": None, "b": "x", "c": "y"}, CHAIN, culprits={"b"})
 
-    assert verdicts(judge(same, known)) == {"a": "identical", "b": "accepted", "c": "accepted"}  # type: ignore[arg-type]
+    assert verdicts(judge(same, known)) == {"a": "identical", "b": "accepted", "c": "accepted"}
     other = report({"a": None, "b": "z", "c": "y"}, CHAIN, culprits={"b"})
-    assert verdicts(judge(other, known))["b"] == "culprit"  # type: ignore[arg-type]
+    assert verdicts(judge(other, known))["b"] == "culprit"
 
 
 def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_differ_from_the_recording() -> None:
     known = accepted({"a": None, "b": "x", "c": "y"})
 
-    found = judge(report({"a": None, "b": "x", "c": "new"}, CHAIN, culprits={"b"}), known)  # type: ignore[arg-type]
+    found = judge(report({"a": None, "b": "x", "c": "new"}, CHAIN, culprits={"b"}), known)
 
     assert verdicts(found) == {"a": "identical", "b": "accepted", "c": "culprit"}
 
@@ -175,7 +167,7 @@ def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_di
 def test_what_follows_from_a_new_change_is_downstream_of_it() -> None:
     known = accepted({"a": "x", "b": "x", "c": "x"})
 
-    found = judge(report({"a": "x", "b": "new", "c": "new"}, CHAIN, culprits={"a"}), known)  # type: ignore[arg-type]
+    found = judge(report({"a": "x", "b": "new", "c": "new"}, CHAIN, culprits={"a"}), known)
 
     assert verdicts(found) == {"a": "accepted", "b": "culprit", "c": "downstream"}
 
@@ -184,13 +176,13 @@ def test_operators_that_feed_each_other_are_both_named_rather_than_neither() -> 
     circle = {"a": {"b"}, "b": {"a"}, "c": {"b"}}
     known = accepted({"a": "x", "b": "x", "c": "x"}, circle)
 
-    found = judge(report({"a": "n", "b": "n", "c": "n"}, circle, culprits=set()), known)  # type: ignore[arg-type]
+    found = judge(report({"a": "n", "b": "n", "c": "n"}, circle, culprits=set()), known)
 
     assert verdicts(found) == {"a": "culprit", "b": "culprit", "c": "downstream"}
 
 
 def test_an_accepted_change_that_is_gone_does_not_pass_unseen() -> None:
-    found = judge(report({"a": None, "b": None, "c": None}, CHAIN), accepted({"a": None, "b": "x", "c": None}))  # type: ignore[arg-type]
+    found = judge(report({"a": None, "b": None, "c": None}, CHAIN), accepted({"a": None, "b": "x", "c": None}))
 
     assert verdicts(found)["b"] == "not as accepted"
     assert not Checked(Path("x"), "x", report({}, {}), found).passed
@@ -225,7 +217,7 @@ def test_an_accepted_outcome_does_not_pass_where_it_could_not_be_repeated_in_par
     made = report({"a": "x"}, {})
     setattr(made.operators[0], part, 2)
 
-    found = judge(made, known)  # type: ignore[arg-type]
+    found = judge(made, known)
 
     assert verdicts(found) == {"a": "unverifiable"}
     assert not found[0].passed
@@ -307,7 +299,7 @@ def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Excepti
     assert not one.passed
 
 
-def test_an_operators_traceback_is_told_from_the_runtimes_own() -> None:
+def test_operator_traceback_is_distinguished_from_that_of_the_runtime() -> None:
     def failing(operator: str | None) -> Checked:
         def verify(path: Path) -> VerifyReport:
             raise RunFailed("it failed", "Traceback (most recent call last)", operator)

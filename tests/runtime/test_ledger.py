@@ -259,7 +259,7 @@ def test_what_was_not_recorded_for_one_operator_is_made_again(recorded: Path, tm
     assert {v.operator for v in report.operators} == {"mix", "smooth"}
 
 
-def test_within_a_tolerance_nobody_is_blamed_for_what_was_made_of_another_input(recorded: Path, tmp_path: Path) -> None:
+def test_within_tolerance_no_operator_is_blamed_for_another_input(recorded: Path, tmp_path: Path) -> None:
     sensors = ("test/left/", "test/right/")
     thin = rewritten(recorded, tmp_path / "thin.mcap", stored=lambda stream, seq: stream.startswith(sensors))
     graph = load_graph(HERE / "mixed.yaml", settings=["count=60"])

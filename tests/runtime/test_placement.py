@@ -124,11 +124,7 @@ def test_a_replay_in_two_halves_covers_every_source_message_once(recording: tupl
 
 @pytest.mark.long
 def test_the_window_grows_when_the_graph_must_look_further_ahead() -> None:
-    graph = chain(
-        "far: {use: runtime_operators:LookAhead, inputs: {a: left/fast, b: left/slow}}",
-        count=300,
-        ratio=60,
-    )
+    graph = chain("far: {use: runtime_operators:LookAhead, inputs: {a: left/fast, b: left/slow}}", count=300, ratio=60)
 
     report = run(graph, window=(8, 1 << 30))
 

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from dataflow.client.attach import NotRunning, find_running
-from dataflow.client.playback import ask, steering
-from dataflow.client.replay_bar import ReplayBar
+from dataflow.client.playback import ReplayBar, ask, steering
 from dataflow.graph import load_graph
 from dataflow.supervision.run import replay, run
 from dataflow.supervision.supervisor import Supervisor

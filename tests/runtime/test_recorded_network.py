@@ -15,7 +15,7 @@ from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import graph_as_recorded, recorded_graph
 from dataflow.supervision import supervisor
 from dataflow.supervision.run import replay, run
-from dataflow.transport.sockets import reserve_endpoints
+from dataflow.transport.registry import Reservation
 
 GRAPH = """
 graph: chain
@@ -31,7 +31,7 @@ operators:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A recording whose graph listens and connects where nothing harmful is: on sockets of this test."""
     path = tmp_path_factory.mktemp("network") / "run.mcap"
-    with reserve_endpoints(2) as reserved:
+    with Reservation(2) as reserved:
         listen, connect = reserved.endpoints
         run(load_text(GRAPH.format(listen=listen, connect=connect)), record=path, placement="one_process")
         yield path, listen, connect

@@ -157,7 +157,7 @@ def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: 
     assert {file.name for file in store().iterdir()} == {digest for code in codes[:2] for digest in code.values()}
     with Recording(recording) as opened:
         totals = [number(item.message) for item in opened.messages(["test/sum/total"])]
-        said = [str(item.message.text) for item in opened.messages(["test/@/logs"])]  # type: ignore[attr-defined]
+        said = [str(item.message.text) for item in opened.messages(["test/@/logs"])]
     assert [text for text in said if text.startswith("is not reloaded, the old code goes on: cannot import 'offering")]
     assert all(b - a in (0, 1, 100, 10_000) for a, b in itertools.pairwise(totals))
 

@@ -165,7 +165,7 @@ def test_every_kind_of_field_comes_back_as_it_was() -> None:
     assert back.places.maxlen == 2
     assert [type(back.by_id[5]), type(back.counts), back.counts["none"]] == [list, Counter, 0]
     assert back.last is not None
-    assert back.last.digest() == state.last.digest()  # type: ignore[union-attr]
+    assert back.last.digest() == state.last.digest()
     assert type(back.single) is np.float32
     assert back.windows["left"].total == 2.0
 
@@ -267,7 +267,7 @@ def test_a_snapshot_that_does_not_fit_is_refused_with_the_field(change: dict[str
 
 def test_a_value_that_no_snapshot_can_hold_is_named_with_its_place() -> None:
     state = State()
-    state.by_id[3] = [object()]  # type: ignore[list-item]
+    state.by_id[3] = [object()]
 
     with pytest.raises(StateError, match=r"state.by_id\[3\]\[0\] is a object; a state holds numbers"):
         plain(state)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.execution.judge import Judge
+from dataflow.execution.comparator import Comparator
 from dataflow.execution.snapshots import differing_fields, pack_state, unpack_state
 from dataflow.records.firing import FiringRecord
 from dataflow.state import StateError
@@ -141,7 +141,7 @@ def test_states_of_changed_code_are_compared_in_the_fields_of_both(recorded: Any
     record = FiringRecord("op", 0, 3, "snapshot", 5, detail={"state": pack_state(recorded)})
 
     for changed in ({"robot": "before"}, {}):
-        judge = Judge("op", (), {})
-        judge.code(changed, {"robot": "now"})
-        judge.state(record, pack_state(here))
-        assert (judge.result.differing == 0) == (alike and bool(changed))
+        comparator = Comparator("op", (), {})
+        comparator.code(changed, {"robot": "now"})
+        comparator.state(record, pack_state(here))
+        assert (comparator.result.differing == 0) == (alike and bool(changed))

@@ -68,7 +68,7 @@ def thin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_change_in_one_operator_names_it_and_the_firing_and_nobody_else(recorded: Path) -> None:
+def test_change_in_one_operator_names_it_and_its_firing_alone(recorded: Path) -> None:
     graph = load_graph(HERE / "changed.yaml")
 
     report = verify(recorded, graph=graph)

@@ -15,7 +15,7 @@ class Nudged(Smooth):
 
     NUDGE = 1e-6
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         made = super().process(x, context)
         if made is None or self.calls < 5:
             return made
@@ -27,7 +27,7 @@ class Nudged(Smooth):
 class Chatty(Nudged):
     """Nudged, and emits where it had been silent."""
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         made = super().process(x, context)
         if made is None:
             made = FeatureVector(stamp=context.stamp, vectors=[[0.0]], model="test")
@@ -37,7 +37,7 @@ class Chatty(Nudged):
 class Moody(Smooth):
     """Other numbers every time: bytes of the system's generator, which nobody seeds."""
 
-    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:
         made = super().process(x, context)
         if made is None or self.calls < 5:
             return made

@@ -12,20 +12,13 @@ from pathlib import Path
 from textwrap import indent
 
 import pytest
-from typer.testing import CliRunner
+from cli_commands import call
 
-from dataflow.cli.main import app
 from dataflow.graph import load_graph
 from dataflow.scaffold.files import KINDS, NameFault, camel, operator_files, snake
 
 COMPILER = shutil.which("c++")
 REPOSITORY = Path(__file__).resolve().parents[2]
-
-
-def call(*words: object, code: int = 0):
-    outcome = CliRunner().invoke(app, [str(word) for word in words])
-    assert outcome.exit_code == code, (outcome.stdout, outcome.stderr, outcome.exception)
-    return outcome
 
 
 def run_tests(folder: Path, runtime: Path) -> str:

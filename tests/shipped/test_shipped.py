@@ -6,22 +6,14 @@ import json
 from pathlib import Path
 
 import pytest
+from cli_commands import call
 
 from dataflow import shipped
 from dataflow.cli.commands import demo as demo_command
-from dataflow.cli.main import app
 from dataflow.graph import load_graph
 
 
-def call(*words: object, code: int = 0):
-    from typer.testing import CliRunner
-
-    outcome = CliRunner().invoke(app, [str(word) for word in words])
-    assert outcome.exit_code == code, (outcome.stdout, outcome.stderr, outcome.exception)
-    return outcome
-
-
-def test_every_graph_of_the_repository_is_listed_and_says_what_it_is_for(repository: Path) -> None:
+def test_every_graph_of_the_repository_is_listed_with_its_purpose(repository: Path) -> None:
     found = {graph.name: graph for graph in shipped.graphs()}
 
     assert {"simulated_robot", "synthetic_rgbd", "chaos/robot"} <= set(found)
@@ -44,7 +36,7 @@ def test_a_file_of_that_name_comes_first(tmp_path: Path, monkeypatch) -> None:
     assert "the graph has no operators" in call("check", "synthetic_rgbd.yaml", code=1).stdout
 
 
-def test_an_unknown_name_says_where_the_graphs_are_listed(tmp_path: Path, monkeypatch) -> None:
+def test_unknown_name_refers_to_the_list_of_graphs(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert "dataflow graphs lists" in call("check", "nothing.yaml", code=2).stderr
     assert "did you mean 'synthetic_rgbd'?" in call("graphs", "synth_rgbd", code=2).stderr
@@ -64,16 +56,12 @@ def test_the_demo_has_its_graph_and_its_recording() -> None:
     assert shipped.recording("../README") is None
 
 
-def test_the_demo_opens_a_window_where_there_is_a_display(tmp_path: Path, monkeypatch) -> None:
+def test_demo_opens_window_or_writes_file_of_free_name(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DISPLAY", ":7")
     outputs = demo_command._outputs()
     assert (outputs.live_view, outputs.view_file) == ("spawn", None)
-
-
-def test_the_demo_writes_a_file_of_a_free_name_where_there_is_none(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert demo_command._outputs().view_file == Path("dataflow-demo.rrd")
     Path("dataflow-demo.rrd").touch()

@@ -80,7 +80,7 @@ def test_the_wheel_of_the_unpacked_sdist_holds_the_same_as_pip_makes_it(
 ) -> None:
     with tarfile.open(sdist) as archive:
         safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from Python 3.11.4 on
-        archive.extractall(tmp_path / "unpacked", **safely)  # type: ignore[arg-type]
+        archive.extractall(tmp_path / "unpacked", **safely)
     again = build("build_wheel", next((tmp_path / "unpacked").iterdir()), tmp_path)
     with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(again) as other:
         assert sorted(one.namelist()) == sorted(other.namelist())

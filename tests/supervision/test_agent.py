@@ -23,7 +23,7 @@ from dataflow.supervision.core import events
 def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace())
     (tmp_path / "models").write_text("a file where a folder would be")
-    stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")  # type: ignore[arg-type]
+    stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")
     piece = {"path": "models/net.bin", "at": 0, "data": b"x", "last": True, "digest": ""}
     with pytest.raises(files.FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
         stay._take_piece(piece)
@@ -47,8 +47,8 @@ def test_clock_offset_is_sent_only_to_running_processes(monkeypatch: pytest.Monk
     clocks.exchanged(100, 1600, 1700, 1200)
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace(clocks=clocks))
     monkeypatch.setattr(agent, "CLOCK_EVERY", 0.0)
-    stay, children = Stay(SimpleNamespace(name="robot"), None, "run", "none"), Children()  # type: ignore[arg-type]
-    stay._children, stay._corrected = children, frozenset({"camera"})  # type: ignore[assignment]
+    stay, children = Stay(SimpleNamespace(name="robot"), None, "run", "none"), Children()
+    stay._children, stay._corrected = children, frozenset({"camera"})
 
     for _ in range(2):  # started, and started again
         stay._obey("camera", "spawn", {})
@@ -67,7 +67,7 @@ def stay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[Stay
     said: list[tuple[Any, ...]] = []
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace(clocks=Clocks()))
     monkeypatch.setattr(Stay, "_say", lambda _, label, word, /, **fields: said.append((label, word, fields)))
-    made = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "tcp/router")  # type: ignore[arg-type]
+    made = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "tcp/router")
     yield made, said
     for descriptor in (made._woken, made._waking, made._wake):
         os.close(descriptor)
@@ -161,7 +161,7 @@ def test_a_process_is_configured_for_this_machine_and_goes_by_its_clock(stay: tu
     there, _ = stay
     given: list[tuple[str, dict[str, Any]]] = []
     children = SimpleNamespace(send=lambda label, kind, fields, replaces: given.append((kind, fields)))
-    there._children, there._endpoints = children, {"sum": "tcp/here"}  # type: ignore[assignment]
+    there._children, there._endpoints = children, {"sum": "tcp/here"}
     network = {"listen": ["a"], "connect": ["b"], "tls": {"ca": "x"}, "access_control": {"c": "d"}}
     fields = {"listen": ["tcp/there"], "graph": {"network": network}}
     there._obey("sum", "send", {"kind": "operators", "fields": fields, "replaces": False})

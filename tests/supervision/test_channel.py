@@ -12,7 +12,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from dataflow.process.channel import Channel, ChannelClosed, QueuedChannel, ready
+from dataflow.process.channel import Channel, ChannelClosed, QueuedChannel
+from dataflow.process.polling import readable
 
 READS = """
 import sys
@@ -92,7 +93,7 @@ def test_news_follows_what_was_queued_after_older_news() -> None:
     assert process.receive() == ("covered", {"frontier": 2})
     assert process.receive() == ("stop", {})
     process.send("ended", report={"streams": {"a": [1, "b"]}})
-    assert ready([process], 0) == []
+    assert readable([process], 0) == []
     assert list(channel.receive()) == [("ended", {"report": {"streams": {"a": [1, "b"]}}})]
     assert list(channel.receive()) == []
 

@@ -55,10 +55,10 @@ class Scene:
         self.events: list[Event] = []
         self.selector = selectors.DefaultSelector()
         boxes: Any = type("NoBoxes", (), {"make": lambda *_: (), "read": lambda *_: None, "close": lambda *_: None})()
-        rings: Any = type("NoRings", (), {"handed": lambda *_: ()})()
+        links: Any = type("NoLinks", (), {"handed": lambda *_: ()})()
         nursery: Any = self.nursery
         self.children = Children(
-            nursery, {}, self.selector, rings, boxes, lambda: self.now, self.events.append,
+            nursery, {}, self.selector, links, boxes, lambda: self.now, self.events.append,
             lambda label, line: self.events.append(Printed(label, line)),
         )  # fmt: skip
         for label in ("a", "b"):

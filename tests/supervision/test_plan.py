@@ -157,10 +157,10 @@ def test_processes_are_configured_by_the_plan() -> None:
     assert (left["paranoid"], left["window"], left["firings"], left["warm"], left["replay"]) == (
         True, [9, 99], True, None, None
     )  # fmt: skip
-    assert found["sum"]["rings_in"] == [[MEAN]]
-    assert left["rings_out"][1:] == [(False, [FAST]), (False, [FAST])]
+    assert found["sum"]["links_in"] == [[MEAN]]
+    assert left["links_out"][1:] == [(False, [FAST]), (False, [FAST])]
     assert found["@recorder"]["kind"] == "record"
-    assert found["@recorder"]["rings_in"]
+    assert found["@recorder"]["links_in"]
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_live_run_goes_at_the_pace_of_the_clock_and_its_sources_wait_for_no_op
 ) -> None:
     left = configs(live=live, rate=rate, record=Path("run.mcap"))["left"]
     assert (left["rate"], left["live"]) == (expected, live)
-    assert [dropping for dropping, _ in left["rings_out"]] == [False, live, live]  # the recorder takes all
+    assert [dropping for dropping, _ in left["links_out"]] == [False, live, live]  # the recorder takes all
 
 
 def test_a_replay_from_the_middle_begins_warm() -> None:

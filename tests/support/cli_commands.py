@@ -7,9 +7,19 @@ from typing import Any
 
 from typer import Context
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.cli.registry import BUILT_IN
+
+
+def call(*words: object, code: int = 0) -> Any:
+    """Calls a command; the outcome has `exit_code`, `stdout` and `stderr`."""
+    outcome = CliRunner().invoke(app, [str(word) for word in words])
+    told = f"{outcome.stdout}\n{outcome.stderr}\n{outcome.exception!r}"
+    assert outcome.exit_code == code, told
+    assert "Traceback" not in outcome.stderr or code == 1, told
+    return outcome
 
 
 def commands(*, built_in: bool) -> Iterator[tuple[str, Any]]:

@@ -93,7 +93,7 @@ class Robot:
     def poses(self, cls: type = Pose, frame: str = "world", **more: Any) -> list[Any]:
         name = {Pose: "covariance", Odometry: "pose_covariance"}[cls]
         return [
-            cls.from_matrix(  # type: ignore[attr-defined]
+            cls.from_matrix(
                 self.T_world_base[k],
                 stamp=int(self.stamps[k]),
                 frame=frame,
@@ -139,7 +139,7 @@ def errors(robot: Robot, played: Played) -> tuple[Array, Array]:
     """Of position (N,) and orientation (N,), m and rad, at the odometry's stamps as long as the motion is known."""
     known = [m for m in played["odometry"] if m.stamp <= robot.stamps[-1]]
     rows = np.searchsorted(robot.stamps, [m.stamp for m in known])
-    made = np.array([m.matrix() for m in known])  # type: ignore[attr-defined]
+    made = np.array([m.matrix() for m in known])
     true = np.array(robot.T_world_base)[rows]
     turned = Rotation.from_matrix(made[:, :3, :3]) * Rotation.from_matrix(true[:, :3, :3]).inv()
     return np.linalg.norm(made[:, :3, 3] - true[:, :3, 3], axis=1), turned.magnitude()

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from operators.language import Tokenizer
+from operators.language.bpe import Tokenizer
 
 SIDE = 32
 WORDS = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}

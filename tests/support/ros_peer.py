@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import struct
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -69,6 +70,32 @@ class Peer:
 
     def __exit__(self, *_: object) -> None:
         self.session.close()
+
+
+class Read:
+    """A source that is read on a thread, as in a live run."""
+
+    def __init__(self, source: Any) -> None:
+        self.source, self.steps = source, list[Any]()
+        source.setup()
+        self.thread = threading.Thread(target=self._read)
+
+    def _read(self) -> None:
+        for step in self.source.stream():
+            self.steps.append(step)
+
+    def __enter__(self) -> Read:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.stop_reading()
+        self.thread.join(10)
+        self.source.close()
+
+    @property
+    def texts(self) -> list[str]:
+        return [step["message"].text for step in self.steps]
 
 
 class PeerPublisher:

@@ -39,7 +39,7 @@ class Worker:
 def test_figures_of_nothing_are_none(first: int | None, said: str, outcome: str, torn: bool) -> None:
     task = Task(Source("r.mcap", "/r.mcap", "d"), "replay", (), ("replay", None), "key")
 
-    found = perform(task, 9.0, Worker(first, said))  # type: ignore[arg-type]
+    found = perform(task, 9.0, Worker(first, said))
 
     assert (found.outcome, found.torn) == (outcome, torn)
     assert bool(found.rows[0]) == (first is not None)

@@ -11,7 +11,7 @@ import pytest
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
 from dataflow.sweep import plan
-from dataflow.sweep.plan import Code, Digests, SweepError, sources_in, tasks_of
+from dataflow.sweep.plan import Code, Digests, SweepError, grid, sources_in, tasks_of
 
 MODULE = """
 import importlib
@@ -109,3 +109,37 @@ def test_a_graph_with_an_environment_runs_in_several_processes(graph: Graph, tmp
 def test_a_url_that_nothing_here_can_read_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SweepError, match="nope://bucket/runs cannot be read: Protocol not known"):
         sources_in(["nope://bucket/runs"], Digests(tmp_path / "none.json"))
+
+
+def test_every_combination_comes_once_with_the_last_name_changing_fastest() -> None:
+    assert grid(["a=1,2", "b.c=x, y"]) == [
+        (("a", "1"), ("b.c", "x")),
+        (("a", "1"), ("b.c", "y")),
+        (("a", "2"), ("b.c", "x")),
+        (("a", "2"), ("b.c", "y")),
+    ]
+    assert grid([]) == [()]
+
+
+def test_a_comma_inside_brackets_or_quotes_belongs_to_the_value() -> None:
+    assert grid(['classes=[cup, "a,b"],[chair],"x,y"']) == [
+        (("classes", '[cup, "a,b"]'),),
+        (("classes", "[chair]"),),
+        (("classes", '"x,y"'),),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["a"], "expected NAME=VALUE"),
+        (["a="], "expected NAME=VALUE"),
+        (["a=1,,2"], "expected NAME=VALUE"),
+        (["=1"], "expected NAME=VALUE"),
+        (["a=1", "a=2"], "a has values already"),
+        (["a=1,2,1"], "a value stands there twice"),
+    ],
+)
+def test_what_is_no_choice_is_refused(words: list[str], what: str) -> None:
+    with pytest.raises(SweepError, match=what):
+        grid(words)

@@ -59,7 +59,7 @@ def test_a_recording_that_was_replaced_on_a_web_server_is_another_one(web: str, 
     assert first == same != found(tmp_path, f"{web}/runs/a.mcap")
 
 
-def test_what_a_web_server_does_not_have_is_said(web: str, tmp_path: Path) -> None:
+def test_missing_paths_of_a_web_server_are_reported(web: str, tmp_path: Path) -> None:
     for path in ("nowhere", "nowhere/a.mcap"):
         with pytest.raises(SweepError, match=f"no file or folder {web}/{path}"):
             found(tmp_path, f"{web}/{path}")
@@ -93,7 +93,7 @@ def test_the_package_that_a_url_lacks_is_named(
         found(tmp_path, url)
 
 
-def test_a_web_server_that_is_not_there_is_told_from_a_file_that_is_not(tmp_path: Path) -> None:
+def test_unreachable_web_server_is_distinguished_from_missing_file(tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="aiohttp (the [remote] extra) is not installed")
     with pytest.raises(SweepError, match=r"no file or folder http://127\.0\.0\.1:1/runs: .*[Cc]onnect"):
         found(tmp_path, "http://127.0.0.1:1/runs")

@@ -24,7 +24,7 @@ class Numbers(Source):
 
     out: Out[FeatureVector]
 
-    def stream(self):  # type: ignore[no-untyped-def]
+    def stream(self):
         for step in range(STEPS):
             yield {"out": FeatureVector(stamp=step * 10**7, vectors=np.full((1, 1), step, np.float32), model="m")}
 

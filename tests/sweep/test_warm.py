@@ -100,7 +100,7 @@ def test_a_call_that_takes_too_long_is_ended_and_the_next_one_made(
 
 
 @pytest.mark.parametrize("which", ["call", "warm process"])
-def test_a_killed_process_is_told_and_the_next_call_made(
+def test_killed_process_is_reported_and_next_call_made(
     worker: Worker, output: tuple[Path, Path], waits: list[str], which: str
 ) -> None:
     assert worker.call("command", ["--version"], (), output, 60) == 0

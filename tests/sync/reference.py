@@ -37,7 +37,7 @@ def merges(spec: AlignSpec, streams: Streams) -> dict[int, dict[str, object]]:
             for entry in streams[stream]:
                 at = merged.setdefault(entry.stamp, {})
                 if trigger.many:
-                    at.setdefault(trigger.name, {})[stream] = entry  # type: ignore[index]
+                    at.setdefault(trigger.name, {})[stream] = entry
                 else:
                     at[trigger.name] = entry
     return merged
@@ -119,7 +119,7 @@ def firings(
             if len(kept) < len(since):
                 drops[batch.name, "unused"] += len(since) - len(kept)
             inputs[batch.name] = tuple(e for _, _, e in kept)
-        fired.append(Firing(stamp, kind, stamp in ticking, inputs, frozenset(stale_names)))  # type: ignore[arg-type]
+        fired.append(Firing(stamp, kind, stamp in ticking, inputs, frozenset(stale_names)))
     for batch in spec.batches:
         rest = sum(len(streams[s]) for s in batch.streams) - len({g for g in given if g[0] == batch.name})
         if rest:

@@ -41,6 +41,11 @@ def entries(stream: str, *stamps: int) -> list[Entry]:
     return [Entry(stamp, f"{stream}@{stamp}", seq, stream=stream) for seq, stamp in enumerate(stamps)]
 
 
+def push(aligner: Aligner, stream: str, *stamps: int) -> None:
+    for entry in entries(stream, *stamps):
+        aligner.push(stream, entry)
+
+
 def interleave(says: Mapping[str, list[Step]], rng: random.Random) -> Iterator[Step]:
     """Every stream's steps in its own order, mixed at random; now and then one stream runs far ahead."""
     rest = {stream: list(steps) for stream, steps in says.items() if steps}
@@ -137,11 +142,7 @@ def specs(draw: st.DrawFn) -> AlignSpec:
         many = draw(flag)
         batches.append(
             BatchSpec(
-                f"b{i}",
-                streams(many),
-                draw(st.none() | st.integers(1, 3)),
-                draw(st.none() | st.integers(0, 8)),
-                many,
+                f"b{i}", streams(many), draw(st.none() | st.integers(1, 3)), draw(st.none() | st.integers(0, 8)), many
             )
         )
     triggering = {s for t in triggers for s in t.streams}

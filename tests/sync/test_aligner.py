@@ -19,15 +19,10 @@ from dataflow.sync import (
     TriggerSpec,
 )
 
-from .scenarios import entries, poll_all
+from .scenarios import poll_all, push
 
 A = TriggerSpec("a", ("a",))
 B = TriggerSpec("b", ("b",))
-
-
-def push(aligner: Aligner, stream: str, *stamps: int) -> None:
-    for entry in entries(stream, *stamps):
-        aligner.push(stream, entry)
 
 
 def shape(value: InputValue) -> object:
@@ -91,10 +86,7 @@ def test_a_required_sample_that_is_missing_or_stale_drops_the_trigger_and_says_w
     aligner.advance("x", 8)
     assert seen(poll_all(aligner)) == [(7, {"a": 7, "x": 2})]
     assert aligner.drops == {("a", "no_sample"): 1, ("a", "stale"): 1}
-    assert [(d.stamp, d.reason, d.because) for d in aligner.take_drops()] == [
-        (1, "no_sample", "x"),
-        (8, "stale", "x"),
-    ]
+    assert [(d.stamp, d.reason, d.because) for d in aligner.take_drops()] == [(1, "no_sample", "x"), (8, "stale", "x")]
 
 
 def test_an_optional_sample_that_is_stale_is_absent_and_flagged() -> None:
@@ -246,24 +238,18 @@ def test_a_stream_that_breaks_its_promise_is_an_error_that_names_it() -> None:
     ("build", "message"),
     [
         (lambda: AlignSpec(), "nothing would ever make it fire"),
-        (lambda: AlignSpec((A, A)), "declared twice"),
         (lambda: AlignSpec((A,), tolerance=3), "at least two triggers"),
         (lambda: AlignSpec((A, TriggerSpec("m", ("x", "y"), many=True))), "use merge"),
         (lambda: AlignSpec((A, B), static=frozenset("b")), "declare it Sampled"),
-        (
-            lambda: AlignSpec((), (SampledSpec("x", ("x",), before=1),), every=10),
-            "neither static nor `before`",
-        ),
+        (lambda: AlignSpec((), (SampledSpec("x", ("x",), before=1),), every=10), "neither static nor `before`"),
         (lambda: TriggerSpec("a", ("x", "y")), "exactly one stream"),
         (lambda: TriggerSpec("a", ("x", "x"), many=True), "named twice"),
-        (lambda: SampledSpec("x", ("x",), before=0), "at least 1 ns"),
         (lambda: BatchSpec("x", ("x",), max=0), "at least 1 message"),
-        (lambda: AlignSpec((A,), every=0), "at least 1 ns"),
     ],
 )
 def test_a_declaration_that_means_nothing_is_refused(build: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        build()  # type: ignore[operator]
+        build()
 
 
 def test_sampled_streams_keep_only_what_a_future_firing_can_need() -> None:

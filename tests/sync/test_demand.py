@@ -46,16 +46,7 @@ class Graph:
             for i, trigger in enumerate(spec.triggers):
                 for s in trigger.streams:
                     found.append(
-                        Edge(
-                            s,
-                            consumer,
-                            trigger.name,
-                            "trigger",
-                            None,
-                            spec.tolerance,
-                            i == 0,
-                            self.lags.get(s, 0),
-                        )
+                        Edge(s, consumer, trigger.name, "trigger", None, spec.tolerance, i == 0, self.lags.get(s, 0))
                     )
             for sampled in spec.sampled:
                 for s in sampled.streams:

@@ -12,17 +12,12 @@ from hypothesis import strategies as st
 from dataflow.sync import Aligner, AlignSpec, Entry, Firing, TriggerSpec
 
 from . import reference
-from .scenarios import Step, entries, interleave, poll_all, tell
+from .scenarios import Step, entries, interleave, poll_all, push, tell
 
 
 def join(tolerance: int, inputs: int = 2) -> Aligner:
     names = "axyz"[:inputs]
     return Aligner(AlignSpec(tuple(TriggerSpec(n, (n,)) for n in names), tolerance=tolerance))
-
-
-def push(aligner: Aligner, stream: str, *stamps: int) -> None:
-    for entry in entries(stream, *stamps):
-        aligner.push(stream, entry)
 
 
 def pairs(fired: Sequence[Firing]) -> list[tuple[int, int]]:
@@ -69,13 +64,7 @@ def test_unmatched_anchors_and_unmatched_others_are_counted_apart() -> None:
     aligner.end("x", 5)
     assert pairs(poll_all(aligner)) == [(2, 2)]
     assert aligner.drops == {("a", "unmatched"): 2, ("x", "unmatched"): 3}
-    assert {(d.input, d.stamp) for d in aligner.take_drops()} == {
-        ("a", 1),
-        ("a", 3),
-        ("x", 0),
-        ("x", 4),
-        ("x", 5),
-    }
+    assert {(d.input, d.stamp) for d in aligner.take_drops()} == {("a", 1), ("a", 3), ("x", 0), ("x", 4), ("x", 5)}
     assert aligner.take_drops() == []
 
 
@@ -101,7 +90,7 @@ def test_an_anchor_is_passed_over_once_the_tolerance_is() -> None:
     aligner = join(tolerance=10)
     push(aligner, "a", 100)
     aligner.advance("x", 109)
-    assert aligner.waiting().stamp == 100  # type: ignore[union-attr]
+    assert aligner.waiting().stamp == 100
     aligner.advance("x", 110)
     assert aligner.waiting() is None
     assert aligner.drops == {("a", "unmatched"): 1}
@@ -113,7 +102,7 @@ def test_a_later_candidate_waits_for_the_next_anchor_to_be_farther() -> None:
     push(aligner, "x", 104)
     aligner.advance("a", 106)
     assert aligner.poll() is None  # an anchor at 107 would be nearer to 104
-    assert aligner.waiting().needs == {"a": 107}  # type: ignore[union-attr]
+    assert aligner.waiting().needs == {"a": 107}
     aligner.advance("a", 107)  # 2 * 104 - 100 - 1
     assert pairs(poll_all(aligner)) == [(100, 104)]
 

@@ -21,16 +21,11 @@ from dataflow.sync import (
     refs_of,
 )
 
-from .scenarios import HORIZON, Repeater, Scenario, Step, entries, interleave, poll_all, run, scenarios, tell
+from .scenarios import HORIZON, Repeater, Scenario, Step, entries, interleave, poll_all, push, run, scenarios, tell
 
 A = TriggerSpec("a", ("a",))
 B = TriggerSpec("b", ("b",))
 seeds = st.integers(0, 2**32 - 1)
-
-
-def push(aligner: Aligner, stream: str, *stamps: int) -> None:
-    for entry in entries(stream, *stamps):
-        aligner.push(stream, entry)
 
 
 def stamps(firings: list[Firing]) -> list[int]:
@@ -112,7 +107,7 @@ def test_ticks_go_on_by_force_when_the_inputs_have_stopped() -> None:
     aligner = Aligner(AlignSpec((A,), every=10))
     push(aligner, "a", 5)
     assert stamps(poll_all(aligner)) == [5]
-    assert aligner.waiting().stamp == 10  # type: ignore[union-attr]
+    assert aligner.waiting().stamp == 10
     aligner.force("a", 30)
     assert stamps(poll_all(aligner)) == [10, 20, 30]
     push(aligner, "a", 25, 31)
@@ -130,7 +125,7 @@ def test_what_a_restarted_stream_repeats_is_late_and_what_is_new_takes_part() ->
     assert stamps(fired) == [5, 10, 12]
     assert aligner.drops == {("a", "late"): 1, ("x", "late"): 1}
     ref = refs_of(fired[-1]).inputs["a"]
-    assert (ref.stream, ref.incarnation, ref.seq) == ("a", 1, 1)  # type: ignore[union-attr]
+    assert (ref.stream, ref.incarnation, ref.seq) == ("a", 1, 1)
 
 
 def test_a_stream_that_ended_opens_again_when_its_source_restarts() -> None:
@@ -242,10 +237,10 @@ def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
     recorded = Repeater(spec, [refs_of(f) for f in fired])
 
     for step in says["x"]:
-        tell(recorded, step)  # type: ignore[arg-type]
+        tell(recorded, step)
     assert recorded.buffered() == {"a": 0, "x": 0}
     for step in says["a"][: len(fired)]:
-        tell(recorded, step)  # type: ignore[arg-type]
+        tell(recorded, step)
     assert recorded.buffered() == {"a": len(fired), "x": 0}
     assert len(poll_all(recorded)) == len(fired)
     assert recorded.buffered() == {"a": 0, "x": 0}

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dataflow.sync import (
-    AlignSpec,
-    Entry,
-    FiringInputs,
-    MessageRef,
-    RecordedAligner,
-    SampledSpec,
-    TriggerSpec,
-    Uses,
-)
+from dataflow.sync import AlignSpec, Entry, FiringInputs, MessageRef, RecordedAligner, SampledSpec, TriggerSpec, Uses
 
 SPEC = AlignSpec((TriggerSpec("x", ("x",)),), (SampledSpec("map", ("map",)),))
 MAP = MessageRef("map", 0, 0)
@@ -37,7 +28,7 @@ def test_a_message_is_held_until_the_last_firing_that_takes_it(firings: int) -> 
         aligner.push("x", Entry(stamp, seq=stamp))
         firing = aligner.take(record)
         assert firing is not None
-        assert firing.inputs["map"].value == "the map"  # type: ignore[union-attr]
+        assert firing.inputs["map"].value == "the map"
 
     assert aligner.buffered() == {"map": 0, "x": 0}
     assert not aligner.takes("map", Entry(0))

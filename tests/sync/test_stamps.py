@@ -43,7 +43,7 @@ def test_durations_are_parsed_exactly(text: str | int, nanoseconds: int) -> None
 )
 def test_a_bad_duration_says_what_would_be_right(value: object, hint: str) -> None:
     with pytest.raises(ValueError, match=hint):
-        parse_duration(value)  # type: ignore[arg-type]
+        parse_duration(value)
 
 
 @given(st.integers(0, FOREVER - 1))

@@ -62,7 +62,7 @@ def test_no_more_calls_wait_than_are_allowed(
         hasty.call("verify", {"recording": loud[0]})
 
 
-def test_a_process_that_ends_is_said(patient: Jobs, tmp_path: Path) -> None:
+def test_process_that_ends_without_answer_is_reported(patient: Jobs, tmp_path: Path) -> None:
     (tmp_path / "ends.py").write_text("import os\nprint('a last word', flush=True)\nos._exit(3)\n")
     graph = tmp_path / "ends.yaml"
     graph.write_text("graph: ends\noperators:\n  a: {use: 'ends:A'}\n")

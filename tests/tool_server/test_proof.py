@@ -41,7 +41,7 @@ def reported(*found: Verification, **more: Any) -> VerifyReport:
     return VerifyReport(found, (), more.pop("facts", ()), 0, 0, 0.0, 0.0, **more)
 
 
-def test_one_that_differs_each_time_or_on_another_machine_was_so_before_the_fix(wrong: Recording) -> None:
+def test_operator_differing_each_time_or_on_another_machine_is_not_judged(wrong: Recording) -> None:
     graph = graph_that_is_here(wrong)[0]
 
     others = judge(wrong, reported(differing("sine"), repeated={"sine": False}), graph, "sum")
@@ -114,5 +114,5 @@ def test_one_that_writes_into_its_inputs_or_was_not_made_again_is_a_reason(wrong
         ({"unknown": 1}, "1 of 9 calls could not be made again (their state is not known)"),
     ],
 )
-def test_calls_that_were_not_made_are_told_with_the_reason(lost: dict[str, Any], told: str) -> None:
+def test_calls_not_made_are_reported_with_reason(lost: dict[str, Any], told: str) -> None:
     assert unmade(Verification("sum", firings=9, **lost)) == told

@@ -82,23 +82,33 @@ class Scaled(Operator):
 """
 
 
+def commit(folder: Path) -> None:
+    """Commits all files of a folder."""
+    git = ["git", "-C", str(folder), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "As it was"]):
+        subprocess.run([*git, *words], check=True, timeout=60)
+
+
+def committed(folder: Path, name: str, text: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, str]:
+    """A committed module with an operator `Scaled`, and a recording by it; it is imported anew then."""
+    file = folder / f"{name}.py"
+    file.write_text(text)
+    commit(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    graph = load_text(
+        "graph: scaled\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
+        f"  scaled: {{use: '{name}:Scaled', inputs: {{x: src/x}}}}\n"
+    )
+    dataflow.run(graph, record=folder / "right.mcap")
+    monkeypatch.delitem(sys.modules, name)
+    return file, str(folder / "right.mcap")
+
+
 def test_the_changed_line_that_made_a_call_differ_is_named_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "scaled_operators.py"
-    file.write_text(SCALED)
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
-    for words in (["init", "-q"], ["add", file.name], ["commit", "-qm", "Right"]):
-        subprocess.run([*git, *words], check=True, timeout=60)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    graph = load_text(
-        "graph: scaled\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
-        "  scaled: {use: 'scaled_operators:Scaled', inputs: {x: src/x}}\n"
-    )
-    recording = str(tmp_path / "right.mcap")
-    dataflow.run(graph, record=recording)
+    file, recording = committed(tmp_path, "scaled_operators", SCALED, monkeypatch)
     file.write_text(SCALED.replace("x.vectors * 2", "2.0 * x.vectors").replace("vectors + 1", "vectors + 10"))
-    monkeypatch.delitem(sys.modules, "scaled_operators")
     wrong = SCALED[: SCALED.index("+ 1")].count("\n") + 1
 
     told = ask("lines", recording, operator="scaled")
@@ -132,25 +142,10 @@ def test_the_changed_line_that_made_a_call_differ_is_named_first(
 def test_a_changed_default_of_a_parameter_is_a_change_that_is_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, right = (
-        tmp_path / "gained_operators.py",
-        SCALED.replace("x.vectors * 2", "x.vectors * self.gain")
-        .replace("    x: In[", '    gain: float = Param(2.0, doc="gain")\n    x: In[')
-        .replace("Operator, Out", "Operator, Out, Param"),
-    )
-    file.write_text(right)
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
-    for words in (["init", "-q"], ["add", file.name], ["commit", "-qm", "Right"]):
-        subprocess.run([*git, *words], check=True, timeout=60)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    graph = load_text(
-        "graph: gained\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
-        "  scaled: {use: 'gained_operators:Scaled', inputs: {x: src/x}}\n"
-    )
-    recording = str(tmp_path / "right.mcap")
-    dataflow.run(graph, record=recording)
+    right = SCALED.replace("x.vectors * 2", "x.vectors * self.gain").replace("Operator, Out", "Operator, Out, Param")
+    right = right.replace("    x: In[", '    gain: float = Param(2.0, doc="gain")\n    x: In[')
+    file, recording = committed(tmp_path, "gained_operators", right, monkeypatch)
     file.write_text(right.replace("2.0, doc", "3.0, doc").replace("vectors + 1", "1 + vectors"))
-    monkeypatch.delitem(sys.modules, "gained_operators")
 
     told = ask("lines", recording, operator="scaled")
 
@@ -330,7 +325,7 @@ def torn(bugs: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> str:
 LOST = "51 calls could not be made again (the first is call 650: bugs/src/x #650 is not recorded)"
 
 
-def test_calls_that_could_not_be_made_are_said_by_each_tool(torn: str) -> None:
+def test_each_tool_reports_calls_that_could_not_be_made(torn: str) -> None:
     lost = {"count": 51, "first": 650, "why": "bugs/src/x #650 is not recorded"}
     with pytest.raises(ToolError, match=re.escape(f"sum: 650 calls give what was recorded; {LOST}")):
         ask("diff", torn, operator="sum")
@@ -418,9 +413,7 @@ def test_an_operator_that_did_not_repeat_before_the_fix_is_named_and_only_judged
     (tmp_path / "fixed_scale.py").write_text(SHARED)
     imports = "from shared_factor import FACTOR" if shares else ""
     (tmp_path / "by_chance.py").write_text(CHANCE.format(imports=imports))
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=robot", "-c", "user.email=robot@localhost"]
-    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "Wrong"]):
-        subprocess.run([*git, *words], check=True, timeout=60)
+    commit(tmp_path)
     graph = load_text(
         "graph: shared\noperators:\n  src: {use: 'zoo.bugs:Numbers', params: {steps: 8}}\n"
         "  scaled: {use: 'fixed_scale:Scaled', inputs: {x: src/x}}\n"
@@ -463,7 +456,7 @@ def test_a_wrong_call_becomes_a_test(bugs: dict[str, str], tmp_path: Path) -> No
         ask("capture", bugs["right"], operator="sine", to=str(file))
 
 
-def test_blame_leads_to_the_source_and_tells_how_far_it_is(bugs: dict[str, str]) -> None:
+def test_blame_leads_to_the_source_and_reports_progress(bugs: dict[str, str]) -> None:
     said: list[str] = []
     arguments = {"recording": bugs["wrong"], "field": "sine/out.vectors[0,0]@1"}
     told = json.loads(json_text(answer("blame", arguments, said.append)))

@@ -7,27 +7,12 @@ import queue
 import sys
 from typing import Any
 
-import numpy as np
-from transport_envelopes import carrying
+from transport_envelopes import carrying, depth_image
 
-from dataflow.messages import DepthImage
-from dataflow.transport import (
-    Bus,
-    Kind,
-    NetworkConfig,
-    TapClient,
-    TapWindow,
-    decode,
-    encode,
-    register,
-)
+from dataflow.transport import Bus, Kind, NetworkConfig, TapClient, TapWindow, decode, encode, register
 
 DEPTH = "robot1/camera/depth"
 WAIT = 30.0
-
-
-def depth_image(stamp: int, side: int = 256) -> DepthImage:
-    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))
 
 
 def say(**fields: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from dataflow.transport import Bus, NetworkConfig, reserve_endpoints
+from dataflow.transport import Bus, NetworkConfig, Reservation
 
 sys.path.append(str(Path(__file__).parent))
 PEER = Path(__file__).with_name("bus_peer.py")
@@ -91,7 +91,7 @@ def peer() -> Iterator[Callable[..., Peer]]:
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     """A free endpoint on this machine."""
-    with reserve_endpoints(1) as reserved:
+    with Reservation(1) as reserved:
         yield reserved.endpoints[0]
 
 

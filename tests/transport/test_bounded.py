@@ -12,7 +12,7 @@ from dataflow.transport.bounded import within
 from dataflow.transport.publisher import BusError, undeclare
 
 
-def test_an_act_that_ends_has_ended_when_it_is_said_so() -> None:
+def test_finished_call_has_ended_when_reported() -> None:
     done: list[str] = []
 
     assert within(10.0, lambda: done.append(threading.current_thread().name), "leave")

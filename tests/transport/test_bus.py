@@ -9,11 +9,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
-from transport_envelopes import carrying
+from transport_envelopes import carrying, depth_image
 
-from dataflow.messages import DepthImage
 from dataflow.transport import (
     Bus,
     BusError,
@@ -23,15 +21,10 @@ from dataflow.transport import (
     NetworkError,
     decode,
     encode,
-    reserve_endpoints,
 )
 from dataflow.transport.network import is_local
 
 DEPTH = "robot1/camera/depth"
-
-
-def depth_image(stamp: int, side: int = 4) -> DepthImage:
-    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))
 
 
 def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
@@ -50,7 +43,7 @@ def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
     assert first.counters()["published_messages"] == len(sent)
 
 
-def test_a_publisher_knows_whether_anybody_listens(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
+def test_publisher_knows_whether_it_has_subscribers(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
     first, second = pair
     publisher = first.publisher(DEPTH)
     assert not publisher.matched
@@ -196,7 +189,7 @@ def test_an_endpoint_in_use_is_an_error_that_names_it(open_bus: Callable[..., Bu
         ("tcp/127.0.0.1:0#iface=eth0", False),
     ],
 )
-def test_only_loopback_is_listened_on_unless_the_graph_says_so(endpoint: str, local: bool) -> None:
+def test_only_loopback_is_listened_on_unless_exposed(endpoint: str, local: bool) -> None:
     assert is_local(endpoint) == local
     if not local:
         with pytest.raises(NetworkError, match="can be reached from other machines"):
@@ -212,7 +205,8 @@ def test_a_malformed_endpoint_or_setting_is_named() -> None:
         NetworkConfig(zenoh={"no/such/setting": 1}).zenoh_config()
 
 
-def test_reserved_endpoints_differ_and_can_be_listened_on_at_once(open_bus: Callable[..., Bus]) -> None:
-    with reserve_endpoints(3) as reserved:
-        assert len(set(reserved.endpoints)) == 3
-        assert open_bus(listen=reserved.endpoints).id
+def test_reasons_name_no_file_of_a_library() -> None:
+    with pytest.raises(BusError) as raised:
+        Bus(NetworkConfig(connect=("tcp/127.0.0.1:1",), zenoh={"mode": "client", "connect/timeout_ms": 100}))
+    assert "cannot connect to tcp/127.0.0.1:1" in str(raised.value)
+    assert ".rs:" not in str(raised.value)

@@ -27,7 +27,7 @@ class Subscriber:
 
 def publishes(outside: OutsidePublisher, subscriber: Subscriber, numbers: range) -> None:
     for number in numbers:
-        outside.put(subscriber, number.to_bytes(4, "little"))  # type: ignore[arg-type]
+        outside.put(subscriber, number.to_bytes(4, "little"))
 
 
 def test_everything_is_published_in_order_before_it_is_closed() -> None:
@@ -64,7 +64,7 @@ def test_a_run_that_loses_nothing_waits_for_a_slow_subscriber() -> None:
     assert counted.as_dict()["unpublished"] == 0
 
 
-def test_closing_does_not_wait_for_a_subscriber_that_takes_nothing(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_closing_does_not_wait_for_a_subscriber_that_takes_nothing(monkeypatch) -> None:
     monkeypatch.setattr("dataflow.transport.outside.CLOSE_WITHIN", 0.01)
     subscriber, outside = Subscriber(), OutsidePublisher(Counters(), lossless=False)
     publishes(outside, subscriber, range(3))

@@ -16,8 +16,8 @@ from transport_envelopes import Holder, carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport.codec import encode_head, encode_parts, parts_size
-from dataflow.transport.counters import Counters
 from dataflow.transport.pool import Block, SharedPool
+from dataflow.transport.publisher import Counters
 from dataflow.transport.shared import Board, PoolReader, make_board
 
 KIB = 1 << 10

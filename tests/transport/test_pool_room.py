@@ -160,7 +160,7 @@ STEPS = st.lists(st.tuples(st.sampled_from(["make", "send", "drop", "release"]),
 
 @settings(max_examples=60, deadline=None)
 @given(STEPS)
-def test_nothing_that_anybody_holds_is_ever_written_over(steps: list[tuple[str, int]]) -> None:
+def test_held_blocks_are_never_overwritten(steps: list[tuple[str, int]]) -> None:
     pool, holder = SharedPool(4 << 20), Holder()
     make_large_arrays_in(pool.room)
     held: list[DepthImage] = []

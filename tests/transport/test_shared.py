@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgpack
-import numpy as np
 import pytest
-from transport_envelopes import carrying
+from transport_envelopes import carrying, depth_image
 
 from dataflow.messages import DepthImage
 from dataflow.messages.base import Message
@@ -30,10 +29,6 @@ from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION
 
 DEPTH = "robot1/camera/depth"
 BLOCK = 384 << 10  # what a 256 x 256 float32 image takes
-
-
-def depth_image(stamp: int, side: int = 256) -> DepthImage:
-    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))
 
 
 def shared_files() -> set[str]:
@@ -90,7 +85,7 @@ def test_a_block_is_not_used_again_while_any_view_of_it_lives(shared: Shared) ->
     held = message.data[10:12, 3]  # a view of a view; the message itself is gone
     del message
     for seq in range(1, 30):
-        assert shared.passed(seq) == depth_image(seq)
+        assert shared.passed(seq) == depth_image(seq, 256)
     assert held.tolist() == [0.0, 0.0]
     assert shared.fanout.counters()["shared_messages"] == 30
     assert shared.fanout.counters()["shared_full"] == 0
@@ -103,16 +98,16 @@ def test_without_room_messages_travel_whole_and_are_counted(shared: Shared) -> N
         while not (taken := shared.taken()):
             shared.fanout.flush()
         held += taken
-    assert held == [depth_image(i) for i in range(7)]
+    assert held == [depth_image(i, 256) for i in range(7)]
     counts = shared.fanout.counters()
     assert (counts["shared_messages"], counts["shared_full"]) == (4, 3)
     held.clear()
     taken.clear()
-    assert shared.passed(7) == depth_image(7)
+    assert shared.passed(7) == depth_image(7, 256)
     assert shared.fanout.counters()["shared_messages"] == 5
 
 
-def test_a_pool_that_nobody_holds_is_cut_anew_for_another_size(shared: Shared) -> None:
+def test_unheld_pool_is_cut_anew_for_another_size(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     held.clear()
     assert shared.passed(9, 512) == depth_image(9, 512)  # 1 MB: fits only where all four were
@@ -132,7 +127,7 @@ def test_a_consumer_that_takes_nothing_leaves_room_for_the_others(monkeypatch: p
     shared = Shared(consumers=2, blocks=8, most=(1000, 1 << 30))
     for seq in range(50):
         shared.send(seq)
-        assert shared.taken(0) == [depth_image(seq)]
+        assert shared.taken(0) == [depth_image(seq, 256)]
     counts = shared.fanout.counters()
     assert (counts["shared_messages"], counts["shared_full"]) == (50, 0)
     held = [m.stamp for m in shared.taken(1)]
@@ -155,7 +150,7 @@ def test_what_a_consumer_held_that_was_replaced_is_free(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     shared.outgoing[0].take_leave(1)
     shared.consumers[0] = shared.consumer(life=2)
-    assert [shared.passed(seq) == depth_image(seq) for seq in range(4, 8)] == [True] * 4
+    assert [shared.passed(seq) == depth_image(seq, 256) for seq in range(4, 8)] == [True] * 4
     assert shared.fanout.counters()["shared_full"] == 0
     held.clear()
 
@@ -173,7 +168,7 @@ def test_messages_of_a_killed_producer_stay_readable_and_it_leaves_nothing() -> 
         messages += shared.taken()
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
-    assert messages == [depth_image(i) for i in range(4)]
+    assert messages == [depth_image(i, 256) for i in range(4)]
     assert shared_files() == files
     shared.close()
 

@@ -47,7 +47,7 @@ def test_without_taps_an_offer_does_nothing(server: TapServer) -> None:
             raise AssertionError("an offer without taps looked at the message")
 
     assert not server.active
-    server.offer(DEPTH, Untouchable())  # type: ignore[arg-type]
+    server.offer(DEPTH, Untouchable())
     assert server.counters() == {"taps": 0, "sent": 0, "skipped": 0, "malformed": 0}
 
 
@@ -58,7 +58,7 @@ def test_a_tap_gets_the_streams_it_named_in_order(
         eventually(lambda: server.active)
         for seq in range(20):
             server.offer(DEPTH, envelope(seq))
-            server.offer(SCAN, encode(envelope(seq, SCAN)))
+            server.offer(SCAN, envelope(seq, SCAN))
         assert taken(client) == [(DEPTH, seq) for seq in range(20)]
         assert client.skipped == 0
     eventually(lambda: not server.active)
@@ -155,11 +155,11 @@ def test_what_zenoh_drops_does_not_use_up_the_window(
 ) -> None:
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=2)) as client:
         eventually(lambda: server.active)
-        put, server._put = server._put, lambda *_: None  # type: ignore[method-assign]
+        put, server._put = server._put, lambda *_: None
         server.offer(DEPTH, envelope(0))
         server.offer(DEPTH, envelope(1))
         eventually(lambda: server.counters()["sent"] == 2)
-        server._put = put  # type: ignore[method-assign]
+        server._put = put
         server.offer(DEPTH, envelope(2))
         arrived = client.take(timeout=5.0)
         assert arrived is not None
@@ -172,12 +172,12 @@ def test_the_newest_of_a_stream_is_sent_again_when_zenoh_dropped_it(
     monkeypatch.setattr("dataflow.transport.tap_server.SYNC_EVERY", 0.05)
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=4)) as client:
         eventually(lambda: server.active)
-        put, server._put = server._put, lambda *_: None  # type: ignore[method-assign]
+        put, server._put = server._put, lambda *_: None
         server.offer(SCAN, envelope(0, SCAN))
         server.offer(DEPTH, envelope(0))
         server.offer(DEPTH, envelope(1))
         eventually(lambda: server.counters()["sent"] == 3)
-        server._put = put  # type: ignore[method-assign]
+        server._put = put
         assert sorted(taken(client)) == [(DEPTH, 1), (SCAN, 0)]
         counters = server.counters()
         assert (counters["sent"], counters["skipped"]) == (2, 1)
@@ -195,7 +195,7 @@ def test_whatever_is_dropped_streams_stay_in_order_and_end_with_their_last_messa
     monkeypatch.setattr("dataflow.transport.tap_server.SYNC_EVERY", 0.02)
     chance = random.Random(seed)
     put = server._put
-    server._put = lambda *a: None if chance.random() < 0.4 else put(*a)  # type: ignore[method-assign]
+    server._put = lambda *a: None if chance.random() < 0.4 else put(*a)
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=4)) as client:
         eventually(lambda: server.active)
         got: dict[str, list[int]] = {DEPTH: [], SCAN: []}

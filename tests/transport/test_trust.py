@@ -7,19 +7,13 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from dataflow.messages import DepthImage
-from dataflow.transport import Bus, reserve_endpoints
+from dataflow.transport import Bus, Reservation
 from dataflow.transport.registry import RegistryError
 
 DEPTH = "robot1/camera/depth"
 NOBODY = 65534
-
-
-def depth_image(stamp: int, side: int = 4) -> DepthImage:
-    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))
 
 
 # Sockets
@@ -30,7 +24,7 @@ def sockets(endpoint: str) -> Path:
 
 
 def test_sockets_lie_in_a_folder_of_their_owner_and_go_with_it(open_bus: Callable[..., Bus]) -> None:
-    with reserve_endpoints(3) as reserved:
+    with Reservation(3) as reserved:
         assert len(set(reserved.endpoints)) == 3
         open_bus(listen=reserved.endpoints).close()
         folder = sockets(reserved.endpoints[0]).parent
@@ -42,7 +36,7 @@ def test_a_path_too_long_for_a_socket_is_replaced_by_the_temporary_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, open_bus: Callable[..., Bus]
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("long" * 20)))
-    with reserve_endpoints(1) as reserved:
+    with Reservation(1) as reserved:
         folder = sockets(reserved.endpoints[0]).parent
         assert folder.parent.name == f"dataflow-{os.getuid()}"
         assert folder.stat().st_mode & 0o777 == 0o700
@@ -60,7 +54,7 @@ def test_sockets_that_a_killed_run_left_are_removed(tmp_path: Path, monkeypatch:
     assert not left.exists()
 
 
-def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     folder = tmp_path / "dataflow"
     folder.mkdir(mode=0o700)
@@ -68,12 +62,12 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytes
         pytest.skip("only root can make a folder for somebody else")
     os.chown(folder, NOBODY, NOBODY)
     with pytest.raises(RegistryError, match=f"belongs to {NOBODY}"):
-        reserve_endpoints(1)
+        Reservation(1)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
 def test_another_user_can_neither_connect_nor_listen(open_bus: Callable[..., Bus]) -> None:
-    with reserve_endpoints(2) as reserved:
+    with Reservation(2) as reserved:
         path, free = map(sockets, reserved.endpoints)
         open_bus(listen=reserved.endpoints[:1])
         path.chmod(0o777)  # whatever the socket's own mode, its folder keeps others out

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from dataflow.messages import DepthImage
 from dataflow.messages.base import Message
 from dataflow.transport import Envelope, Kind
 from dataflow.transport.pool import Block
@@ -26,3 +29,7 @@ class Holder:
 
     def release(self, block: Block) -> None:
         self.done.add(block.generation)
+
+
+def depth_image(stamp: int, side: int = 4) -> DepthImage:
+    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))

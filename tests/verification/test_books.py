@@ -89,7 +89,7 @@ def test_the_book_of_an_operator_is_that_of_all_its_records_wherever_they_lie(da
 
 def test_a_parameter_that_lies_before_the_finish_which_it_followed_does_not_hide_it() -> None:
     kinds = {2: "param", 0: "setup", 1: "finish"}
-    laid = [FiringRecord("smooth", 0, index, kind, 0) for index, kind in kinds.items()]  # type: ignore[arg-type]
+    laid = [FiringRecord("smooth", 0, index, kind, 0) for index, kind in kinds.items()]
     books = Books(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), load_graph(MIXED))
     assert books.of("smooth").finished
 

@@ -86,4 +86,4 @@ def test_a_part_that_has_no_message_has_nothing_to_verify() -> None:
     part = SimpleNamespace(path=Path("kept.mcap"), streams={}, metadata={CUT: Cut("run", 5, None).metadata()})
 
     with pytest.raises(ReplayError, match=r"kept\.mcap: it has no message from the stamp 5 on"):
-        _span(part, None)  # type: ignore[arg-type]
+        _span(part, None)

@@ -105,7 +105,7 @@ def test_the_debugger_goes_to_a_miss_and_asks_on_demand(asked: Path) -> None:
         assert "EffectMiss: miss at effect 0" in (found.error or "")
         debugged = Debugger(recording, "describe", changed, make_effects=True).goto(0)
         [made] = debugged.made
-        assert "URLError" in made.here.text  # type: ignore[union-attr]
+        assert "URLError" in made.here.text
 
 
 @pytest.mark.long

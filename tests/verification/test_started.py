@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from dataflow.process.channel import ready
+from dataflow.process.polling import readable
 from dataflow.supervision.core.report import RunFailed
 from dataflow.verification.workers.prestart import EarlyWorkers, Started, early_workers
 from dataflow.verification.workers.processes import Call, call_workers
@@ -69,7 +69,7 @@ def test_single_early_worker_that_is_not_taken_is_ended() -> None:
     before = children()
     workers = EarlyWorkers(1)
     [worker] = workers._waiting
-    assert ready([worker.channel], 60.0)
+    assert readable([worker.channel], 60.0)
 
     workers.close()
 

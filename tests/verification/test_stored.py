@@ -17,7 +17,7 @@ def check(recorded: dict[tuple[int, int], bytes], *, static: bool = False, whole
 
 
 @given(st.dictionaries(places, digests), st.lists(st.tuples(places, digests)), st.randoms(), st.booleans())
-def test_every_message_is_counted_once_whatever_the_order(recorded, stored, random, whole) -> None:  # type: ignore[no-untyped-def]
+def test_every_message_is_counted_once_whatever_the_order(recorded, stored, random, whole) -> None:
     first, second = check(recorded, whole=whole), check(recorded, whole=whole)
     shuffled = sorted({place: (place, digest) for place, digest in stored}.values())
     for place, digest in shuffled:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+
 import numpy as np
 import pytest
 from made_video import PERIOD, clip, decoded
@@ -23,48 +26,57 @@ WAYS = [
     ("h265", "open-gop=1:ref=3", "yuv420p"),
     ("h265", "tskip=1:cu-lossless=1:weightp=1:max-merge=2", "yuv420p"),
 ]
+Made = Callable[..., PacketDecoder]
+
+
+@pytest.fixture
+def made() -> Iterator[Made]:
+    """Decoders, which are closed at the end."""
+    with ExitStack() as stack:
+        yield lambda *given, **options: stack.enter_context(closing(PacketDecoder(*given, **options)))
 
 
 @pytest.mark.parametrize(("format_", "options", "pixels"), WAYS)
-def test_each_packet_gives_the_pixels_of_ffmpeg_called_directly(format_: str, options: str, pixels: str) -> None:
+def test_each_packet_gives_the_pixels_of_ffmpeg_called_directly(
+    made: Made, format_: str, options: str, pixels: str
+) -> None:
     packets = clip(format_, options=options, pixels=pixels)
     expected = decoded(format_, packets)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     assert len(packets) == len(expected) == 24
     for packet, frame in zip(packets, expected, strict=True):
         assert np.array_equal(decoder.decode(packet), frame)
-    decoder.close()
 
 
-def test_pictures_of_10_bits_are_scaled_to_8() -> None:
+def test_pictures_of_10_bits_are_scaled_to_8(made: Made) -> None:
     packets = clip("h265", pixels="yuv420p10le")
-    decoder = PacketDecoder("h265")
+    decoder = made("h265")
     for packet, frame in zip(packets, decoded("h265", packets), strict=True):
         pixels = decoder.decode(packet)
         assert pixels is not None
         assert np.abs(pixels.astype(int) - frame).mean() < 2  # the two scale colours by other filters
-    decoder.close()
 
 
 @FORMATS
-def test_frames_are_the_same_from_any_key_frame(format_: str) -> None:
+def test_frames_are_the_same_from_any_key_frame(made: Made, format_: str) -> None:
     packets = clip(format_, options="open-gop=1")
     keys = [k for k, packet in enumerate(packets) if is_key(format_, packet)]
     assert keys == [0, 8, 16]
     for key in keys:
-        decoder = PacketDecoder(format_)
+        decoder = made(format_)
         for packet, frame in zip(packets[key:], decoded(format_, packets)[key:], strict=True):
             assert np.array_equal(decoder.decode(packet), frame)
-        decoder.close()
 
 
 @FORMATS
 @pytest.mark.parametrize("options", ["", "ref=4"])
 @pytest.mark.parametrize("lost", [0, 1, 5, 8, 10, 23])
-def test_no_frame_is_given_after_a_lost_packet_until_a_key_frame(format_: str, options: str, lost: int) -> None:
+def test_no_frame_is_given_after_a_lost_packet_until_a_key_frame(
+    made: Made, format_: str, options: str, lost: int
+) -> None:
     packets = clip(format_, options=options)
     expected = decoded(format_, packets)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     for k, packet in enumerate(packets):
         if k == lost:
             continue
@@ -73,14 +85,13 @@ def test_no_frame_is_given_after_a_lost_packet_until_a_key_frame(format_: str, o
         assert (frame is None) == behind == bool(decoder.lost)
         if frame is not None:
             assert np.array_equal(frame, expected[k])
-    decoder.close()
 
 
 @pytest.mark.parametrize("count", [15, 16, 17, 32])
-def test_a_loss_of_all_numbers_shows_in_the_stamps(count: int) -> None:
+def test_a_loss_of_all_numbers_shows_in_the_stamps(made: Made, count: int) -> None:
     packets = clip("h264", count=48, group=48)
     expected = decoded("h264", packets)
-    decoder = PacketDecoder("h264")
+    decoder = made("h264")
     for k in range(10):
         decoder.decode(packets[k], k * PERIOD + k % 2 * 1_000_000)
     assert decoder.decode(packets[10 + count], (10 + count) * PERIOD) is None
@@ -89,7 +100,6 @@ def test_a_loss_of_all_numbers_shows_in_the_stamps(count: int) -> None:
     for k in range(1, 14):  # a pause in which nothing is lost, and no key frame can be: ten pictures have followed it
         frame = decoder.decode(packets[k], k * PERIOD + (k > 9) * 9 * PERIOD)
         assert np.array_equal(frame, expected[k])
-    decoder.close()
 
 
 @pytest.mark.parametrize(
@@ -106,27 +116,25 @@ def test_a_loss_of_all_numbers_shows_in_the_stamps(count: int) -> None:
         ("h265", "open-gop=0", 24, range(3, 27)),
     ],
 )
-def test_a_lost_key_frame_shows_in_the_stamps(format_: str, options: str, group: int, lost: range) -> None:
+def test_a_lost_key_frame_shows_in_the_stamps(made: Made, format_: str, options: str, group: int, lost: range) -> None:
     packets = clip(format_, count=2 * group + 2, group=group, options=options)
     expected = decoded(format_, packets)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     for k, packet in enumerate(packets):
         if k not in lost:
             frame = decoder.decode(packet, k * PERIOD + k % 2 * PERIOD // 10)
             assert (frame is None) == (lost.stop <= k < 2 * group), decoder.lost
             assert frame is None or np.array_equal(frame, expected[k])
-    decoder.close()
 
 
 @FORMATS
 @pytest.mark.parametrize("twice", [0, 3, 7, 8])
-def test_a_packet_that_comes_twice_gives_its_frame_twice(format_: str, twice: int) -> None:
+def test_a_packet_that_comes_twice_gives_its_frame_twice(made: Made, format_: str, twice: int) -> None:
     packets = clip(format_)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     for k, (packet, frame) in enumerate(zip(packets, decoded(format_, packets), strict=True)):
         for _ in range(1 + (k == twice)):
             assert np.array_equal(decoder.decode(packet, k * PERIOD), frame)
-    decoder.close()
 
 
 @FORMATS
@@ -146,57 +154,51 @@ def test_a_loss_is_named_by_its_pictures(format_: str) -> None:
 
 @FORMATS
 @pytest.mark.parametrize("at", [0, 3, 8, 13])
-def test_another_decoder_goes_on_from_the_state_of_one(format_: str, at: int) -> None:
+def test_another_decoder_goes_on_from_the_state_of_one(made: Made, format_: str, at: int) -> None:
     packets = clip(format_)
-    one, other = PacketDecoder(format_), PacketDecoder(format_)
+    one, other = made(format_), made(format_)
     for packet in packets[: at + 1]:
         one.decode(packet)
     other.take_up(one.state())
     for packet in packets[at + 1 :]:
         assert np.array_equal(one.decode(packet), other.decode(packet))
         assert one.state() == other.state()
-    one.close()
-    other.close()
 
 
-def test_a_state_while_pictures_are_lost_keeps_the_reason() -> None:
+def test_a_state_while_pictures_are_lost_keeps_the_reason(made: Made) -> None:
     packets = clip("h264")
-    one, other = PacketDecoder("h264"), PacketDecoder("h264")
+    one, other = made("h264"), made("h264")
     for packet in (packets[0], packets[2]):
         one.decode(packet)
     other.take_up(one.state())
     assert other.decode(packets[3]) is None
     assert other.lost == one.lost != ""
     assert other.decode(packets[8]) is not None
-    other.close()
 
 
 @FORMATS
-def test_a_key_frame_without_parameter_sets_takes_those_that_came_before(format_: str) -> None:
+def test_a_key_frame_without_parameter_sets_takes_those_that_came_before(made: Made, format_: str) -> None:
     packets = list(clip(format_))
     sets, key = packets[8][: packets[8].rfind(b"\0\0\1")], packets[8][packets[8].rfind(b"\0\0\1") :]
     assert is_key(format_, sets + key)
     assert not is_key(format_, key)
     packets[8] = key
-    one, other = PacketDecoder(format_), PacketDecoder(format_)
+    one, other = made(format_), made(format_)
     expected = decoded(format_, clip(format_))
     for k in range(12):
         assert np.array_equal(one.decode(packets[k]), expected[k])
     other.take_up(one.state())
     assert np.array_equal(other.decode(packets[12]), expected[12])
-    one.close()
-    other.close()
 
 
 @FORMATS
-def test_a_stream_goes_on_with_pictures_of_another_size(format_: str) -> None:
+def test_a_stream_goes_on_with_pictures_of_another_size(made: Made, format_: str) -> None:
     small, large = clip(format_), clip(format_, width=128)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     for packet, frame in zip(
         (*small[:9], *large), (*decoded(format_, small)[:9], *decoded(format_, large)), strict=True
     ):
         assert np.array_equal(decoder.decode(packet), frame)
-    decoder.close()
 
 
 @FORMATS
@@ -213,9 +215,9 @@ def test_pictures_that_are_too_large_are_refused_before_they_are_decoded(format_
 
 
 @FORMATS
-def test_a_damaged_packet_never_ends_in_more_than_a_lost_picture(format_: str) -> None:
+def test_a_damaged_packet_never_ends_in_more_than_a_lost_picture(made: Made, format_: str) -> None:
     packets, rng = clip(format_), np.random.default_rng(0)
-    decoder = PacketDecoder(format_)
+    decoder = made(format_)
     decoder.decode(packets[0])
     for _ in range(6):
         for packet in packets[:4]:
@@ -226,15 +228,16 @@ def test_a_damaged_packet_never_ends_in_more_than_a_lost_picture(format_: str) -
             assert (frame is None) == bool(decoder.lost)
     for packet, expected in zip(packets[8:12], decoded(format_, packets)[8:12], strict=True):
         assert np.array_equal(decoder.decode(packet), expected)
-    decoder.close()
 
 
 @pytest.mark.long
 @FORMATS
 @pytest.mark.parametrize("number", [8, 9])
-def test_a_flipped_bit_of_a_header_is_a_lost_picture_whatever_it_announces(format_: str, number: int) -> None:
+def test_a_flipped_bit_of_a_header_is_a_lost_picture_whatever_it_announces(
+    made: Made, format_: str, number: int
+) -> None:
     packets = clip(format_)
-    decoder, reasons = PacketDecoder(format_), ""
+    decoder, reasons = made(format_), ""
     for bit in range(8 * 3, 8 * 34):  # of the first parameter set, or of the slice
         damaged = bytearray(packets[number])
         damaged[bit // 8] ^= 1 << bit % 8
@@ -246,16 +249,14 @@ def test_a_flipped_bit_of_a_header_is_a_lost_picture_whatever_it_announces(forma
         assert "B-frames" in reasons
     for packet, expected in zip(packets[16:20], decoded(format_, packets)[16:20], strict=True):
         assert np.array_equal(decoder.decode(packet), expected)
-    decoder.close()
 
 
-def test_parameter_sets_of_a_damaged_packet_are_forgotten() -> None:
+def test_parameter_sets_of_a_damaged_packet_are_forgotten(made: Made) -> None:
     packets = list(clip("h264"))
-    decoder = PacketDecoder("h264", max_pixels=7000)
+    decoder = made("h264", max_pixels=7000)
     decoder.decode(packets[0])
     large = clip("h264", width=128)[0]
     assert decoder.decode(large) is None
     assert "8192 pixels, more than max_pixels=7000" in decoder.lost
     key = packets[8][packets[8].rfind(b"\0\0\1") :]
     assert np.array_equal(decoder.decode(key), decoded("h264", tuple(packets))[8])
-    decoder.close()

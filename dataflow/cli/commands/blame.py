@@ -11,18 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import begin_again
-from dataflow.cli.support.arguments import (
-    Json,
-    ModuleFolders,
-    OtherGraph,
-    OtherSettings,
-    RecordingFile,
-    existing_recording,
-    number,
-    span,
-)
-from dataflow.cli.support.output import count, err, fail, friendly_errors, out, plural, print_json, seconds, table
+from dataflow.cli.support.again import RECORDED, CodeOptions
+from dataflow.cli.support.arguments import Json, RecordingFile, existing_recording, number, span
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import count, err, fail, out, plural, print_json, seconds, table
 
 if TYPE_CHECKING:
     from dataflow.blame.field import Field
@@ -34,34 +26,25 @@ MOST_ROWS = 40
 LONGEST_VALUE = 60
 Budget = Annotated[
     float,
-    typer.Option(
-        "--budget",
-        metavar="SECONDS",
-        parser=number(0.1, 86_400, "seconds"),
-        help="Time to look for it; what is left then is named.",
+    option(
+        "--budget SECONDS", "Time to look for it; what is left then is named.", parser=number(0.1, 86_400, "seconds")
     ),
 ]
 
 
 def blame(
     recording: RecordingFile,
-    field: Annotated[
-        str,
-        typer.Option("--field", metavar="STREAM.FIELD@SECONDS", help="The value, of the last message by that time."),
-    ],
+    field: Annotated[str, option("--field STREAM.FIELD@SECONDS", "The value, of the last message by that time.")],
     budget: Budget = 60.0,
     tolerance: Annotated[
         float,
-        typer.Option(
-            "--tolerance",
-            metavar="PART",
+        option(
+            "--tolerance PART",
+            "What a floating-point value must change by to count, as a part of it.",
             parser=number(0, 1, "a part of the value"),
-            help="What a floating-point value must change by to count, as a part of it.",
         ),
     ] = 1e-4,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
     """Find what decided a value: the chain of calls back to the sensors' messages.
@@ -82,11 +65,10 @@ def blame(
       dataflow blame run.mcap --field "tracks.boxes[ids == 7]@12.4" --budget 300
       dataflow blame run.mcap --field odometry.position@3 --json
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        asked = _field(field)
-        loaded = begin_again(recording, graph, settings, path, stream=asked.stream)
-        chain, begin = _found(recording, asked, loaded, budget, tolerance)
+    recording = existing_recording(recording)
+    asked = _field(field)
+    loaded = code.begin_again(recording, stream=asked.stream)
+    chain, begin = _found(recording, asked, loaded, budget, tolerance)
     if json:
         print_json(chain.as_json())
     else:
@@ -97,14 +79,9 @@ def blame(
 
 def drops(
     recording: RecordingFile,
-    worse: Annotated[
-        str,
-        typer.Option("--worse", metavar="EXPRESSION", help='True of figures that are bad: "ate_rmse_m > 0.05".'),
-    ],
+    worse: Annotated[str, option("--worse EXPRESSION", 'True of figures that are bad: "ate_rmse_m > 0.05".')],
     budget: Budget = 60.0,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
+    code: CodeOptions = RECORDED,
     json: Json = False,
 ) -> None:
     """Find which drops, late messages and timeouts of a live run cost its result.
@@ -120,22 +97,21 @@ def drops(
       dataflow drops run.mcap --worse "ate_rmse_m > 0.05"
       dataflow drops run.mcap --worse "score.recall < 0.8" --budget 300
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path)
-        from dataflow.drops.search import Drops
-        from dataflow.recording import Recording
+    recording = existing_recording(recording)
+    loaded = code.begin_again(recording)
+    from dataflow.drops.search import Drops
+    from dataflow.recording import Recording
 
-        with Recording(recording) as opened, progress() as show, redirect_stdout(sys.stderr):
+    with Recording(recording) as opened, progress() as show, redirect_stdout(sys.stderr):
 
-            def watch(replays: int, left: int) -> None:
-                show(f"{plural(replays, 'replay')}; losses undone in the next one: {count(left)}")
+        def watch(replays: int, left: int) -> None:
+            show(f"{plural(replays, 'replay')}; losses undone in the next one: {count(left)}")
 
-            try:
-                cost = Drops(opened, worse, loaded, budget=budget, watch=watch).find()
-            except SyntaxError as error:
-                raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
-            begin, _ = span(opened, opened.streams) or (0, 0)
+        try:
+            cost = Drops(opened, worse, loaded, budget=budget, watch=watch).find()
+        except SyntaxError as error:
+            raise fail(f"--worse {worse}: no Python expression: {error.msg}") from None
+        begin, _ = span(opened, opened.streams) or (0, 0)
     if json:
         print_json(cost.as_json())
     else:

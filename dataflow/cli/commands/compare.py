@@ -11,18 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.sweep import Again, Folder, Jobs, Patience, Ray, Recordings, print_torn, torn_of, work
+from dataflow.cli.commands.sweep import AS_USUAL, Recordings, WorkOptions, print_torn, torn_of, work
 from dataflow.cli.support.again import take_environment
-from dataflow.cli.support.arguments import (
-    Json,
-    Map,
-    ModuleFolders,
-    Overwrite,
-    find_modules_in,
-    graph_file,
-    output_file,
-)
-from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, table
+from dataflow.cli.support.arguments import Json, Overwrite, find_modules_in, graph_file, output_file
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import count, fail, out, plural, print_json, table
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
@@ -40,42 +33,28 @@ WHOLE = 0.9
 """Share of a change from which an operator is said to bring it."""
 
 
-Chosen = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="[a:|b:]NAME=VALUE",
-        help="A graph parameter, or OPERATOR.PARAM: of A, of B, or of both. May be repeated.",
-    ),
-]
-Explain = Annotated[
-    str | None,
-    typer.Option(
-        "--explain",
-        metavar="FIGURE",
-        help=f"Which operator brings the change of this figure? Replays the {EXPLAINED} recordings with the largest "
-        "change in the direction of its mean by A, with the outputs of one operator after the other as B made them.",
-    ),
-]
-Rerun = Annotated[
-    Path | None,
-    typer.Option("--rerun", metavar="FILE.rrd", help="Draw the recording where B is worst: A and B as layers."),
-]
-
-
 def compare(
-    graph: Annotated[Path, typer.Argument(metavar="GRAPH", help="The graph.")],
+    graph: Annotated[Path, argument("GRAPH", "The graph.")],
     recordings: Recordings = None,
-    settings: Chosen = None,
-    maps: Map = None,
-    path: ModuleFolders = None,
-    folder: Folder = Path("out/sweep"),
-    jobs: Jobs = None,
-    ray: Ray = None,
-    timeout: Patience = 3600.0,
-    again: Again = False,
-    explain: Explain = None,
-    rerun: Rerun = None,
+    settings: Annotated[
+        list[str] | None,
+        option(
+            "--set [a:|b:]NAME=VALUE", "A graph parameter, or OPERATOR.PARAM: of A, of B, or of both. May be repeated."
+        ),
+    ] = None,
+    how: WorkOptions = AS_USUAL,
+    explain: Annotated[
+        str | None,
+        option(
+            "--explain FIGURE",
+            f"Which operator brings the change of this figure? Replays the {EXPLAINED} recordings with the largest "
+            "change in the direction of its mean by A, with the outputs of one operator after the other as B made "
+            "them.",
+        ),
+    ] = None,
+    rerun: Annotated[
+        Path | None, option("--rerun FILE.rrd", "Draw the recording where B is worst: A and B as layers.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -101,20 +80,11 @@ def compare(
       dataflow compare cloud --recordings runs --set b:cloud.stride=8 --explain f1
     """
     choices = _choices(settings or ())
-    with friendly_errors():
-        find_modules_in(path)
-        _prepare(graph, choices[0], explain, rerun, overwrite=overwrite)
-        from dataflow.sweep.plan import SweepError
-        from dataflow.sweep.run import Sweep
-
-        try:
-            file = graph_file(graph)
-            given = (choices, maps or (), path or ())
-            plan = Sweep(recordings or (), "replay", file, *given, folder, jobs, ray, timeout, again, "compare")
-            work(plan, quiet=quiet)
-            _look(plan, explain, rerun, json=json, verbose=verbose)
-        except SweepError as error:
-            raise fail(str(error)) from None
+    find_modules_in(how.path)
+    _prepare(graph, choices[0], explain, rerun, overwrite=overwrite)
+    plan = how.plan(recordings, graph, choices, name="compare")
+    work(plan, quiet=quiet)
+    _look(plan, explain, rerun, json=json, verbose=verbose)
 
 
 def _prepare(graph: Path, first: Choice, explain: str | None, rerun: Path | None, *, overwrite: bool) -> None:

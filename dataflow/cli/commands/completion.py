@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.text import Text
 
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, out
 
 VARIABLE = "_DATAFLOW_COMPLETE"
@@ -31,12 +31,8 @@ def _typer() -> Any:
 
 
 def completion(
-    shell: Annotated[
-        str | None, typer.Argument(metavar="SHELL", help="bash, zsh, fish or powershell. Default: that of SHELL.")
-    ] = None,
-    install: Annotated[
-        bool, typer.Option("--install", metavar=" ", help="Set it up for this user instead of printing it.")
-    ] = False,
+    shell: Annotated[str | None, argument("SHELL", "bash, zsh, fish or powershell. Default: that of SHELL.")] = None,
+    install: Annotated[bool, option("--install", "Set it up for this user instead of printing it.")] = False,
 ) -> None:
     """Print the script by which a shell completes commands, options, graphs and the names of what runs.
 

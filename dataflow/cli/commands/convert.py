@@ -5,52 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.support.arguments import (
-    FLAG,
     AnyRecording,
-    Clock,
-    End,
     Json,
     OutInstead,
     Overwrite,
-    Start,
-    Streams,
+    Selection,
     Strict,
-    Without,
-    chosen_streams,
     existing_recording,
     named_once,
     output_file,
     refuse_of_recording,
     window,
 )
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    count,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    say,
-    shown,
-    table,
-)
+from dataflow.cli.support.edited_files import Quiet
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, count, counting, fail, out, plural, print_json, say, shown, table
 
 if TYPE_CHECKING:
     from dataflow.interop.account import Account
-    from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.source import ExportSource
     from dataflow.interop.playing import Wishes
 
 Format = Literal[
@@ -73,45 +57,36 @@ SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 _MCAP = ("mcap", "foxglove", "ros2")
 """Formats that have places for attachments and metadata records."""
 
-Depth = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--depth",
-        metavar="TOPIC[=UNITS]",
-        help="16-bit images of this topic are depth of so many units a metre: 1000 unless given.",
-    ),
-]
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertOptions:
+    """The options of `dataflow convert`, in the order of its help."""
+
+    out_option: OutInstead = None
+    to: Annotated[
+        Format | None, option("--to FORMAT", "The format; the examples name all of them. Not needed for NAME.rrd.")
+    ] = None
+    chosen: Selection
+    action: Annotated[str | None, option("--action STREAM", "Of lerobot: the stream that is the action.")] = None
+    task: Annotated[str, option("--task TEXT", "Of lerobot: what is done.")] = ""
+    depth: Annotated[
+        list[str] | None,
+        option(
+            "--depth TOPIC[=UNITS]",
+            "16-bit images of this topic are depth of so many units a metre: 1000 unless given.",
+        ),
+    ] = None
+    lossy: Annotated[bool, option("--lossy", "Write values with fewer bits where the format has fewer.")] = False
+    strict: Strict = False
+    overwrite: Overwrite = False
+    quiet: Quiet = False
+    json: Json = False
 
 
 def convert(
     recording: AnyRecording,
-    output: Annotated[
-        Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
-    ] = None,
-    out_option: OutInstead = None,
-    to: Annotated[
-        Format | None,
-        typer.Option(
-            "--to", metavar="FORMAT", help="The format; the examples name all of them. Not needed for NAME.rrd."
-        ),
-    ] = None,
-    streams: Streams = None,
-    without: Without = None,
-    start: Start = None,
-    end: End = None,
-    clock: Clock = "auto",
-    action: Annotated[
-        str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
-    ] = None,
-    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
-    depth: Depth = None,
-    lossy: Annotated[
-        bool, typer.Option("--lossy", metavar=FLAG, help="Write values with fewer bits where the format has fewer.")
-    ] = False,
-    strict: Strict = False,
-    overwrite: Overwrite = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")] = False,
-    json: Json = False,
+    options: ConvertOptions,
+    output: Annotated[Path | None, argument("OUTPUT", "The file or folder to write; or name it with --out.")] = None,
 ) -> None:
     """Convert a recording or a bag to another format.
 
@@ -149,32 +124,35 @@ def convert(
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
-    with friendly_errors():
-        existing_recording(recording)
-        output, to = _target(named_once("OUTPUT", output, out_option), to)
-        _check_output(output, to, overwrite)
-        scales = _depth_scales(depth or (), to)
-        if to == "rrd":
-            _draw(recording, output, streams, without, start, end, clock, strict=strict, json=json)
-            return
-        from dataflow.interop.playing import Wishes
-
-        wishes = Wishes(scales, lossy=lossy, strict=strict)
-        if not to.startswith("lerobot") and (action is not None or task):
-            raise fail("--action and --task are of --to lerobot and lerobot-v3")
-        with (
-            _opened(recording, streams, without, start, end, clock, wishes) as material,
-            _progress(quiet or json) as watch,
-            _complete(output) as place,
-        ):
-            done = _export(material, place, to, watch, action, task, lossy=lossy)
-        done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
-        shown([*material.account.notes, *material.account.short])
-    if json:
-        print_json(done.as_json() | {"source": material.account.as_json()})
+    existing_recording(recording)
+    output, to = _target(named_once("OUTPUT", output, options.out_option), options.to)
+    _check_output(output, to, options.overwrite)
+    scales = _depth_scales(options.depth or (), to)
+    if to == "rrd":
+        _draw(recording, output, options)
     else:
-        _report(done, material.account, output)
-    _fail_if_short(material.account)
+        _convert(recording, output, to, scales, options)
+
+
+def _convert(recording: Path, output: Path, to: Format, scales: dict[str, float], options: ConvertOptions) -> None:
+    from dataflow.interop.playing import Wishes
+
+    wishes = Wishes(scales, lossy=options.lossy, strict=options.strict)
+    if not to.startswith("lerobot") and (options.action is not None or options.task):
+        raise fail("--action and --task are of --to lerobot and lerobot-v3")
+    with (
+        _opened(recording, options.chosen, wishes) as source,
+        counting("converting", hidden=options.quiet or options.json) as watch,
+        _complete(output) as place,
+    ):
+        done = _export(source, place, to, watch, options)
+    done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
+    shown([*source.account.notes, *source.account.short])
+    if options.json:
+        print_json(done.as_json() | {"source": source.account.as_json()})
+    else:
+        _report(done, source.account, output)
+    _fail_if_short(source.account)
 
 
 def _target(output: Path | None, to: Format | None) -> tuple[Path, Format]:
@@ -200,25 +178,14 @@ def _report(done: Exported, account: Account, output: Path) -> None:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
 
 
-def _draw(
-    recording: Path,
-    output: Path,
-    streams: list[str] | None,
-    without: list[str] | None,
-    start: float | None,
-    end: float | None,
-    clock: Literal["auto", "header", "log"],
-    *,
-    strict: bool,
-    json: bool,
-) -> None:
+def _draw(recording: Path, output: Path, options: ConvertOptions) -> None:
     from dataflow.cli.support.drawing import draw_recording, drawn_as_json, report
     from dataflow.view import Save
 
     with _complete(output) as place:
-        drawn = draw_recording(recording, Save(place), streams, without, start, end, clock, strict=strict)
+        drawn = draw_recording(recording, Save(place), options.chosen, strict=options.strict)
     done = _left_by_rrd(recording)
-    if json:
+    if options.json:
         told = {"left_out": done.left_out, "source": drawn.account.as_json()}
         print_json(drawn_as_json(drawn.sink, output) | told)
         _fail_if_short(drawn.account)
@@ -229,12 +196,12 @@ def _draw(
 
 def _left_by_rrd(recording: Path) -> Exported:
     from dataflow.interop.export.extras import tell_left_out
-    from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.source import ExportSource
 
     done = Exported()
-    with Material(recording) as material:
-        tell_left_out(material, "rrd", done)
+    with ExportSource(recording) as source:
+        tell_left_out(source, "rrd", done)
         return done
 
 
@@ -291,43 +258,35 @@ def _complete(output: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _opened(
-    path: Path,
-    words: list[str] | None,
-    without: list[str] | None,
-    start: float | None,
-    end: float | None,
-    clock: Literal["auto", "header", "log"],
-    wishes: Wishes,
-) -> Iterator[Material]:
-    from dataflow.interop.export.material import Material
+def _opened(path: Path, asked: Selection, wishes: Wishes) -> Iterator[ExportSource]:
+    from dataflow.interop.export.source import ExportSource
     from dataflow.recording.layout import RECORDING
     from dataflow.recording.streams.cutting import cut_of
 
     metadata: Mapping[str, Mapping[str, str]]
-    with Material(path, clock=clock, wishes=wishes) as whole:
+    with ExportSource(path, clock=asked.clock, wishes=wishes) as whole:
         found = [*whole.account.notes, *whole.account.short]
         if not any(topic.count for topic in whole.bag.topics.values()) and found:
             raise fail(f"{path} holds no message that can be read: {'; '.join(found)}")
         names = [*whole.streams, *(t.name for t in whole.untouched)]
         namespace, metadata = "", {}
         if not whole.foreign:
-            refuse_of_recording(path, clock, strict=wishes.strict)
+            refuse_of_recording(path, asked.clock, strict=wishes.strict)
             from dataflow.recording import Recording
 
             with Recording(path) as opened:
                 metadata = opened.metadata
                 namespace = metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(words, names, namespace, without) if words or without else None
+        chosen = asked.of(names, namespace) if asked.streams or asked.without else None
         part = None if whole.foreign else cut_of(metadata)
-        begin, finish = window(_span(whole, None if part is None else part.start), start, end, path)
+        begin, finish = window(_span(whole, None if part is None else part.start), asked.start, asked.end, path)
         if whole.clock:
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
-    with Material(path, chosen, clock, begin, finish, wishes) as material:
-        yield material
+    with ExportSource(path, chosen, asked.clock, begin, finish, wishes) as source:
+        yield source
 
 
-def _span(whole: Material, begin: int | None) -> tuple[int, int] | None:
+def _span(whole: ExportSource, begin: int | None) -> tuple[int, int] | None:
     """The first and the last stamp (ns) of all but static streams; `begin`: where a part begins."""
     spans = [(i.first, i.last, 0) for i in whole.streams.values() if not i.static]
     spans += [(t.first, t.last, whole.shift) for t in whole.untouched]
@@ -337,14 +296,7 @@ def _span(whole: Material, begin: int | None) -> tuple[int, int] | None:
 
 
 def _export(
-    material: Material,
-    output: Path,
-    to: str,
-    watch: Callable[[int], None] | None,
-    action: str | None,
-    task: str,
-    *,
-    lossy: bool,
+    source: ExportSource, output: Path, to: str, watch: Callable[[int], None] | None, options: ConvertOptions
 ) -> Exported:
     from dataflow.interop.export.datasets import DATASETS, tell_untaken
     from dataflow.interop.export.extras import tell_left_out
@@ -354,38 +306,27 @@ def _export(
     from dataflow.interop.export.ros2 import export_ros2
     from dataflow.interop.export.tables import export_csv, export_parquet
 
-    done = Exported(lossy=lossy, watch=watch)
+    done = Exported(lossy=options.lossy, watch=watch)
     match to:
         case "mcap":
-            export_own(material, output, done)
+            export_own(source, output, done)
         case "foxglove":
-            export_foxglove(material, output, done)
+            export_foxglove(source, output, done)
         case "ros2":
-            export_ros2(material, output, done)
+            export_ros2(source, output, done)
         case "lerobot" | "lerobot-v3":
             from dataflow.interop.export.lerobot import export_lerobot
             from dataflow.interop.export.lerobot_layouts import Layout21, Layout30
 
             layout = Layout21() if to == "lerobot" else Layout30()
-            export_lerobot(material, output, done, layout=layout, action=action, task=task)
+            export_lerobot(source, output, done, layout=layout, action=options.action, task=options.task)
         case "csv":
-            export_csv(material, output, done)
+            export_csv(source, output, done)
         case "parquet":
-            export_parquet(material, output, done)
+            export_parquet(source, output, done)
         case _:
-            DATASETS[to](material, output, done)
-            tell_untaken(material, to, done)
+            DATASETS[to](source, output, done)
+            tell_untaken(source, to, done)
     if to not in _MCAP:
-        tell_left_out(material, to, done)
+        tell_left_out(source, to, done)
     return done
-
-
-@contextmanager
-def _progress(hidden: bool) -> Iterator[Callable[[int], None] | None]:
-    """Shows how many messages are written."""
-    if hidden or not err.is_terminal:
-        yield None
-        return
-    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
-        task = progress.add_task("converting")
-        yield lambda seen: progress.update(task, description=f"converting · {count(seen)} messages")

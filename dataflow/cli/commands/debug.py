@@ -7,48 +7,21 @@ import shlex
 import sys
 import time
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import begin_again
-from dataflow.cli.support.arguments import (
-    FLAG,
-    Json,
-    ModuleFolders,
-    OtherGraph,
-    OtherSettings,
-    RecordingFile,
-    existing_recording,
-    number,
-    output_file,
-    span,
-)
-from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, size
+from dataflow.cli.support.again import CodeOptions
+from dataflow.cli.support.arguments import Json, RecordingFile, existing_recording, number, output_file, span
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, fail, out, plural, print_json, size
 from dataflow.cli.support.run_options import MakeEffects
 
 EDITOR_COMES = 3600.0
 """Seconds that --dap waits for an editor."""
-
-ViewTarget = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="TARGET",
-        help="Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
-    ),
-]
-DapPort = Annotated[
-    float | None,
-    typer.Option(
-        "--dap",
-        metavar="PORT",
-        parser=number(0, 65535, "a port"),
-        help="Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
-    ),
-]
 
 if TYPE_CHECKING:
     from dataflow.cli.support.debug_shell import Shell
@@ -57,23 +30,65 @@ if TYPE_CHECKING:
     from dataflow.view import ViewerSink
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DebugOptions:
+    """The options of `dataflow debug`, in the order of its help."""
+
+    do: Annotated[
+        list[str] | None,
+        option("--do COMMAND", "Do this and end, without a prompt. May be given several times."),
+    ] = None
+    code: CodeOptions
+    make_effects: MakeEffects = False
+    view: Annotated[
+        str | None,
+        option(
+            "--view TARGET",
+            "Draw what calls were given and made: spawn, serve, rerun+http://HOST:PORT/proxy or FILE.rrd.",
+        ),
+    ] = None
+    dap: Annotated[
+        float | None,
+        option(
+            "--dap PORT",
+            "Serve an editor's debugger there, on this machine only, in place of a prompt; 0: any free port.",
+            parser=number(0, 65535, "a port"),
+        ),
+    ] = None
+    json: Json = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptureOptions:
+    """The options of `dataflow capture`, in the order of its help."""
+
+    operator: Annotated[str, option("--op OPERATOR", "The operator.")]
+    firing: Annotated[
+        int | None,
+        option(
+            "--firing N",
+            "The call, as `debug` counts them: from 0, or from the end if negative. Default: the first wrong one.",
+        ),
+    ] = None
+    predicate: Annotated[
+        str,
+        option(
+            "--predicate EXPRESSION",
+            "True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
+        ),
+    ] = ""
+    to: Annotated[Path | None, option("--to TEST.py", "The file to write. Default: test_OPERATOR_N.py here.")] = None
+    overwrite: Annotated[bool, option("--overwrite", "Replace a file that exists.")] = False
+    code: CodeOptions
+    json: Json = False
+
+
 def debug(
     recording: RecordingFile,
     operator: Annotated[
-        str,
-        typer.Argument(metavar="OPERATOR[@SECONDS]", help="The operator, and when to begin: at its last call by then."),
+        str, argument("OPERATOR[@SECONDS]", "The operator, and when to begin: at its last call by then.")
     ],
-    do: Annotated[
-        list[str] | None,
-        typer.Option("--do", metavar="COMMAND", help="Do this and end, without a prompt. May be given several times."),
-    ] = None,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
-    make_effects: MakeEffects = False,
-    view: ViewTarget = None,
-    dap: DapPort = None,
-    json: Json = False,
+    options: DebugOptions,
 ) -> None:
     """Go to any recorded call of an operator: what it was given, what it made, its state before and after.
 
@@ -97,43 +112,14 @@ def debug(
       dataflow debug run.mcap tracker --do "until len(out.tracks.ids) > 3"
       dataflow debug run.mcap tracker@12.3 --dap 4711
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        if dap is not None and (do or json or view):
-            raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
-        loaded = begin_again(recording, graph, settings, path, operator.partition("@")[0])
-        _debug(recording, operator, loaded, do, make_effects=make_effects, view=view, dap=dap, json=json)
+    recording = existing_recording(recording)
+    if options.dap is not None and (options.do or options.json or options.view):
+        raise fail("--dap serves an editor: --do, --json and --view are for the prompt")
+    loaded = options.code.begin_again(recording, operator.partition("@")[0])
+    _debug(recording, operator, loaded, options)
 
 
-def capture(
-    recording: RecordingFile,
-    operator: Annotated[str, typer.Option("--op", metavar="OPERATOR", help="The operator.")],
-    firing: Annotated[
-        int | None,
-        typer.Option(
-            "--firing",
-            metavar="N",
-            help="The call, as `debug` counts them: from 0, or from the end if negative. Default: the first wrong one.",
-        ),
-    ] = None,
-    predicate: Annotated[
-        str,
-        typer.Option(
-            "--predicate",
-            metavar="EXPRESSION",
-            help="True of a wrong call; sees inp, out, stamp, error. Default: not as recorded, or an error.",
-        ),
-    ] = "",
-    to: Annotated[
-        Path | None,
-        typer.Option("--to", metavar="TEST.py", help="The file to write. Default: test_OPERATOR_N.py here."),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
-    json: Json = False,
-) -> None:
+def capture(recording: RecordingFile, options: CaptureOptions) -> None:
     """Capture a wrong call as a test: the smallest inputs that still show it, without the recording.
 
     Writes a pytest file and a data file beside it. The test fails until the operator is mended. Wrong is a call that
@@ -151,28 +137,11 @@ def capture(
       dataflow capture run.mcap --op tracker --firing 412 --to test_lost_track.py
       dataflow capture run.mcap --op detector --predicate "out.detections is None"
     """
-    with friendly_errors():
-        recording = existing_recording(recording)
-        loaded = begin_again(recording, graph, settings, path, operator)
-        words = [] if graph is None else ["--graph", str(graph)]
-        words += [word for setting in settings or () for word in ("--set", setting)]
-        words += [word for folder in path or () for word in ("--path", str(folder))]
-        _capture(recording, operator, loaded, firing, predicate, to, words, overwrite=overwrite, json=json)
+    recording = existing_recording(recording)
+    _capture(recording, options.code.begin_again(recording, options.operator), options)
 
 
-def _capture(
-    recording: Path,
-    operator: str,
-    graph: Graph | None,
-    firing: int | None,
-    predicate: str,
-    to: Path | None,
-    options: list[str],
-    *,
-    overwrite: bool,
-    json: bool,
-) -> None:
-    """`options`: further words of the command, for the test."""
+def _capture(recording: Path, graph: Graph | None, options: CaptureOptions) -> None:
     from dataflow.capture.capture import LARGE, write_test
     from dataflow.capture.capture import capture as captured
     from dataflow.debugging.debugger import Debugger
@@ -180,21 +149,21 @@ def _capture(
 
     began = time.monotonic()
     with Recording(recording) as opened:
-        debugger = Debugger(opened, operator, graph)
+        debugger = Debugger(opened, options.operator, graph)
         try:
             with redirect_stdout(sys.stderr):  # what operators print
-                found = captured(opened, debugger, firing, predicate)
+                found = captured(opened, debugger, options.firing, options.predicate)
         except SyntaxError as error:
-            raise fail(f"--predicate {predicate}: no Python expression: {error.msg}") from None
+            raise fail(f"--predicate {options.predicate}: no Python expression: {error.msg}") from None
         finally:
             debugger.close()
     name = re.sub(r"\W", "_", found.captured.setting.name)
-    path = output_file(to or Path(f"test_{name}_{found.number}.py"), ".py", overwrite=overwrite, option="--to")
-    words = ["dataflow", "capture", recording.name, "--op", operator, "--firing", str(found.number), *options]
-    if predicate:
-        words += ["--predicate", predicate]
+    path = options.to or Path(f"test_{name}_{found.number}.py")
+    output_file(path, ".py", overwrite=options.overwrite, option="--to")
+    words = ["dataflow", "capture", recording.name, "--op", options.operator, "--firing", str(found.number)]
+    words += [*options.code.words, *(["--predicate", options.predicate] if options.predicate else ())]
     nbytes = write_test(found, path, recording.name, shlex.join(words))
-    if json:
+    if options.json:
         told = {"test": str(path), "call": found.number, "calls": found.calls, "kept": found.left, "bytes": nbytes}
         print_json(told | {"wrong": found.wrong, "begins": found.begins, "seconds": time.monotonic() - began})
         return
@@ -206,36 +175,24 @@ def _capture(
         out.print(Text(f"its inputs are large: more than {size(LARGE)}", style="yellow"))
 
 
-def _debug(
-    recording: Path,
-    operator: str,
-    graph: Graph | None,
-    do: list[str] | None,
-    *,
-    make_effects: bool,
-    view: str | None,
-    dap: float | None,
-    json: bool,
-) -> None:
-    from dataflow.cli.support.debug_shell import Shell, WrongCommand
+def _debug(recording: Path, operator: str, graph: Graph | None, options: DebugOptions) -> None:
+    from dataflow.cli.support.debug_shell import Shell
     from dataflow.debugging.debugger import Debugger
     from dataflow.recording import Recording
 
     name, _, when = operator.partition("@")
     with Recording(recording) as opened:
-        debugger = Debugger(opened, name, graph, make_effects=make_effects)
+        debugger = Debugger(opened, name, graph, make_effects=options.make_effects)
         begin, _ = span(opened, opened.streams) or (0, 0)
-        viewer = None if view is None else _viewer(debugger, view)
-        shell = Shell(debugger, begin, json=json, viewer=viewer)
+        viewer = None if options.view is None else _viewer(debugger, options.view)
+        shell = Shell(debugger, begin, json=options.json, viewer=viewer)
         try:
             first = shell.number(f"@{when}") if when else 0
-            if dap is not None:
-                _serve(debugger, int(dap), first, shell)
+            if options.dap is not None:
+                _serve(debugger, int(options.dap), first, shell)
                 return
-            begun = [f"goto {first}"] if when or do is None else []
-            _converse(shell, [*begun, *(do or ())], interactive=do is None)
-        except WrongCommand as error:
-            raise fail(str(error)) from None
+            begun = [f"goto {first}"] if when or options.do is None else []
+            _converse(shell, [*begun, *(options.do or ())], interactive=options.do is None)
         finally:
             debugger.close()
             if viewer is not None:

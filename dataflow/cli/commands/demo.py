@@ -7,14 +7,15 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.padding import Padding
 from rich.text import Text
 
 from dataflow.cli.support.arguments import Json, number, output_file, span
-from dataflow.cli.support.execution import Outputs, execute, plan_options
-from dataflow.cli.support.output import fail, friendly_errors, out, print_json, say, seconds
-from dataflow.cli.support.run_options import Quiet
+from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import fail, out, print_json, say, seconds
+from dataflow.cli.support.run_options import Quiet, ReportOptions, ViewOptions
+from dataflow.cli.support.storage import RecordOptions
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -27,20 +28,14 @@ SHOWN = "dataflow-demo.rrd"
 def demo(
     to: Annotated[
         str | None,
-        typer.Option(
-            "--to",
-            "--out",
-            "-o",
-            metavar="TARGET",
-            help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: a file. Default: a window, or a file "
+        option(
+            "--to --out -o TARGET",
+            "spawn: a viewer window; serve: a page for a browser; FILE.rrd: a file. Default: a window, or a file "
             "where there is no display.",
         ),
     ] = None,
     duration: Annotated[
-        float,
-        typer.Option(
-            "--seconds", metavar="SECONDS", parser=number(1, 21, "seconds of the recording"), help="So much of it."
-        ),
+        float, option("--seconds SECONDS", "So much of it.", parser=number(1, 21, "seconds of the recording"))
     ] = 21.0,
     quiet: Quiet = False,
     json: Json = False,
@@ -59,29 +54,26 @@ def demo(
     """
     began = time.monotonic()
     import dataflow.shipped as shipped
-    from dataflow.cli.support.execution import checked_outputs
     from dataflow.graph import load_graph
     from dataflow.supervision.run import replay as replay_recording
 
-    with friendly_errors():
-        graph, recording = shipped.graph(GRAPH), shipped.recording(RECORDING)
-        if graph is None or recording is None:
-            where = shipped.folder("graphs").parent
-            raise fail(f"the demo's graph or recording is missing under {where}; install robot-dataflow again")
-        outputs = _outputs() if to is None else checked_outputs(None, to, False, False)
-        loaded = load_graph(graph.path)
-        rate = None if outputs.view_file is not None else 1.0
-        options = plan_options(loaded, outputs, False, False, None, rate, False, 120.0)
-        shown = _announced(recording, loaded, duration, in_real_time=rate is not None)
-        execute(
-            lambda watch: replay_recording(recording, graph=loaded, end=duration, watch=watch, **options),
-            loaded,
-            outputs,
-            shown,
-            began=began,
-            json=json,
-            quiet=quiet,
-        )
+    graph, recording = shipped.graph(GRAPH), shipped.recording(RECORDING)
+    if graph is None or recording is None:
+        where = shipped.folder("graphs").parent
+        raise fail(f"the demo's graph or recording is missing under {where}; install robot-dataflow again")
+    outputs = _outputs() if to is None else checked_outputs(RecordOptions(), ViewOptions(to), overwrite=False)
+    loaded = load_graph(graph.path)
+    rate = None if outputs.view_file is not None else 1.0
+    options = plan_options(loaded, outputs, rate=rate)
+    shown = _announced(recording, loaded, duration, in_real_time=rate is not None)
+    execute(
+        lambda watch: replay_recording(recording, graph=loaded, end=duration, watch=watch, **options),
+        loaded,
+        outputs,
+        shown,
+        ReportOptions(quiet=quiet, json=json),
+        began=began,
+    )
     if not json:
         _print_next(recording, outputs)
 
@@ -121,9 +113,7 @@ def _outputs() -> Outputs:
 
 
 def graphs(
-    name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Print this graph, to read or to begin from.")
-    ] = None,
+    name: Annotated[str | None, argument("NAME", "Print this graph, to read or to begin from.")] = None,
     json: Json = False,
 ) -> None:
     """List the graphs that come with dataflow, or print one.

@@ -6,26 +6,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, Json, Overwrite, Without, chosen_streams, output_file
-from dataflow.cli.support.material import (
+from dataflow.cli.support.arguments import Json, Overwrite, Without, chosen_streams, output_file
+from dataflow.cli.support.edited_files import (
     Compression,
-    Material,
+    EditedFile,
     Out,
     Quiet,
     Word,
     asked_span,
     copying,
     fail_if_lost,
-    opened_material,
+    opened_file,
     print_unknown,
     refuse_itself,
     tell_edited,
 )
-from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, say, seconds, size, table
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import count, fail, out, plural, print_json, say, seconds, size, table
 from dataflow.cli.support.quantities import parsed_duration, parsed_size
 
 if TYPE_CHECKING:
@@ -33,17 +33,12 @@ if TYPE_CHECKING:
 
 
 def cut(
-    recording: Material,
+    recording: EditedFile,
     output: Out,
-    start: Annotated[
-        Word, typer.Option("--from", "--start", metavar="TIME", help="Begin there. Default: at the beginning.")
-    ] = None,
-    end: Annotated[Word, typer.Option("--to", "--end", metavar="TIME", help="End there. Default: at the end.")] = None,
-    duration: Annotated[Word, typer.Option("--duration", metavar="TIME", help="Instead of --to: last so long.")] = None,
-    bare: Annotated[
-        bool,
-        typer.Option("--bare", metavar=FLAG, help="Exactly the messages of the span, without firing records."),
-    ] = False,
+    start: Annotated[Word, option("--from --start TIME", "Begin there. Default: at the beginning.")] = None,
+    end: Annotated[Word, option("--to --end TIME", "End there. Default: at the end.")] = None,
+    duration: Annotated[Word, option("--duration TIME", "Instead of --to: last so long.")] = None,
+    bare: Annotated[bool, option("--bare", "Exactly the messages of the span, without firing records.")] = False,
     compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -74,7 +69,7 @@ def cut(
     """
     from dataflow.editing.part import Part, write_part
 
-    with friendly_errors(), opened_material(recording) as origin, copying("cutting", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("cutting", quiet or json) as watch:
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, [recording])
         part = asked_span(origin, start, end, duration)
@@ -85,11 +80,10 @@ def cut(
 
 
 def filter_(
-    recording: Material,
+    recording: EditedFile,
     output: Out,
     streams: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="STREAM", help="Keep these streams; wildcards work. May be repeated."),
+        list[str] | None, option("--stream STREAM", "Keep these streams; wildcards work. May be repeated.")
     ] = None,
     without: Without = None,
     compression: Compression = "zstd",
@@ -116,7 +110,7 @@ def filter_(
     """
     from dataflow.editing.part import Part, write_part
 
-    with friendly_errors(), opened_material(recording) as origin, copying("filtering", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("filtering", quiet or json) as watch:
         if not streams and not without:
             raise fail("nothing to choose by: name streams with --stream, or with --without")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
@@ -128,16 +122,11 @@ def filter_(
 
 
 def split(
-    recording: Material,
-    every: Annotated[
-        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5min, or a number of seconds.")
-    ] = None,
-    nbytes: Annotated[
-        Word, typer.Option("--size", metavar="SIZE", help="Size of a part, about: 500MB, 2GB, 100MiB.")
-    ] = None,
+    recording: EditedFile,
+    every: Annotated[Word, option("--every TIME", "Event time of a part: 60s, 5min, or a number of seconds.")] = None,
+    nbytes: Annotated[Word, option("--size SIZE", "Size of a part, about: 500MB, 2GB, 100MiB.")] = None,
     folder: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="The folder to write to. Default: named as the recording."),
+        Path | None, option("--out -o DIR", "The folder to write to. Default: named as the recording.")
     ] = None,
     compression: Compression = "zstd",
     overwrite: Overwrite = False,
@@ -162,7 +151,7 @@ def split(
     """
     from dataflow.editing.split import split as parts_of
 
-    with friendly_errors(), opened_material(recording) as origin, copying("splitting", quiet or json) as watch:
+    with opened_file(recording) as origin, copying("splitting", quiet or json) as watch:
         if (every is None) == (nbytes is None):
             raise fail("say how to split: --every TIME or --size SIZE")
         target = folder or recording.with_suffix("")

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from dataflow.cli.support.arguments import FLAG, GraphFile, ModuleFolders, find_modules_in, graph_file
-from dataflow.cli.support.output import fail, friendly_errors, say
+from dataflow.cli.support.arguments import GraphFile, ModuleFolders, find_modules_in, graph_file
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import fail, say
 
 
 def env(
     graph: GraphFile,
-    anew: Annotated[
-        bool, typer.Option("--anew", metavar=FLAG, help="Choose versions anew, and write the locks again.")
-    ] = False,
+    anew: Annotated[bool, option("--anew", "Choose versions anew, and write the locks again.")] = False,
     path: ModuleFolders = None,
 ) -> None:
     """Build the environments of a graph's operators (`env:`), and lock the versions of their packages.
@@ -33,8 +30,7 @@ def env(
     from dataflow.graph import load_graph
 
     find_modules_in(path)
-    with friendly_errors():
-        loaded = load_graph(graph_file(graph))
+    loaded = load_graph(graph_file(graph))
     users: dict[str, list[str]] = {}
     for node in loaded.nodes.values():
         if node.env is not None:

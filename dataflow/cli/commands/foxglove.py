@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import THE_ONLY, Running, say_followed
 from dataflow.cli.support.arguments import (
     Clock,
     End,
@@ -23,37 +23,46 @@ from dataflow.cli.support.arguments import (
     span,
     window,
 )
-from dataflow.cli.support.output import err, fail, friendly_errors, out, plural, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import err, fail, out, plural, say
 
 if TYPE_CHECKING:
-    from dataflow.client.playback import Steering
-    from dataflow.client.replay_bar import ReplayBar
-    from dataflow.foxglove.server import FoxgloveServer
-    from dataflow.interop.clocks import Choice
+    from dataflow.client.playback import ReplayBar, Steering
+    from dataflow.foxglove.server import Controls, FoxgloveServer
     from dataflow.recording import Recorded
 
-PORT = 8765
+PORT, LOCAL = 8765, "127.0.0.1"
+
+
+@dataclass(frozen=True, slots=True)
+class FoxgloveOptions:
+    """The options of `dataflow foxglove`, in the order of its help."""
+
+    port: Annotated[int, option("--port PORT", "Where to listen; 0: a free one.")] = PORT
+    host: Annotated[str, option("--host ADDRESS", "The address to listen on; other machines need another.")] = LOCAL
+    streams: Streams = None
+    speed: Annotated[
+        float, option("--speed FACTOR", "At first.", parser=number(0.01, 100, "a factor of real time"))
+    ] = 1.0
+    start: Start = None
+    end: End = None
+    clock: Clock = "auto"
+    which: Running = THE_ONLY
+
+    def server(
+        self, name: str, namespace: str, controls: Controls | None, shown: tuple[int, int] | None
+    ) -> FoxgloveServer:
+        """The server of what is called `name`, which has `controls` where it can be played."""
+        from dataflow.foxglove.server import FoxgloveServer
+
+        return FoxgloveServer(name, namespace=namespace, host=self.host, port=self.port, controls=controls, span=shown)
 
 
 def foxglove(
+    options: FoxgloveOptions,
     recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="RECORDING", help="A recording or a bag. Without one: the running graph."),
+        Path | None, argument("RECORDING", "A recording or a bag. Without one: the running graph.")
     ] = None,
-    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Where to listen; 0: a free one.")] = PORT,
-    host: Annotated[
-        str, typer.Option("--host", metavar="ADDRESS", help="The address to listen on; other machines need another.")
-    ] = "127.0.0.1",
-    streams: Streams = None,
-    speed: Annotated[
-        float,
-        typer.Option("--speed", metavar="FACTOR", parser=number(0.01, 100, "a factor of real time"), help="At first."),
-    ] = 1.0,
-    start: Start = None,
-    end: End = None,
-    clock: Clock = "auto",
-    graph: GraphName = None,
-    wait: Wait = 0.0,
 ) -> None:
     """Serve a running graph or a recording to Foxglove.
 
@@ -71,52 +80,36 @@ def foxglove(
       dataflow foxglove --stream "camera/*" --port 9000
       dataflow foxglove --wait 10
     """
-    from dataflow.foxglove.server import FoxgloveError
 
-    with friendly_errors():
-        if not 0 <= port < 65536:
-            raise fail(f"--port {port}: expected 0 to 65535")
-        try:
-            if recording is not None:
-                if graph is not None or wait:
-                    raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
-                _play(existing_recording(recording), host, port, streams, speed, start, end, clock)
-            else:
-                if start is not None or end is not None or speed != 1.0 or clock != "auto":
-                    raise fail("--start, --end, --speed and --clock are about a recording; name one")
-                _follow(host, port, streams, graph, wait)
-        except FoxgloveError as error:
-            raise fail(str(error)) from error
+    if not 0 <= options.port < 65536:
+        raise fail(f"--port {options.port}: expected 0 to 65535")
+    if recording is not None:
+        if options.which != THE_ONLY:
+            raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
+        _play(existing_recording(recording), options)
+    else:
+        if (options.start, options.end, options.speed, options.clock) != (None, None, 1.0, "auto"):
+            raise fail("--start, --end, --speed and --clock are about a recording; name one")
+        _follow(options)
 
 
-def _play(
-    path: Path,
-    host: str,
-    port: int,
-    words: list[str] | None,
-    speed: float,
-    start: float | None,
-    end: float | None,
-    stamps: Choice,
-) -> None:
+def _play(path: Path, options: FoxgloveOptions) -> None:
     from dataflow.cli.support.drawing import account_of, opened_streams, say_account
     from dataflow.foxglove import player
-    from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording.layout import RECORDING
 
-    with opened_streams(path, stamps) as opened:
+    with opened_streams(path, options.clock) as opened:
         known = account_of(opened).lines()
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(words, readable, namespace)
+        chosen = chosen_streams(options.streams, readable, namespace)
         whole = span(opened, chosen)
         if whole is None:
             raise fail(f"{path} holds no message of {', '.join(chosen) or 'a type that is known here'}")
-        begin, finish = window(whole, start, end, path)
-        clock = player.Clock(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
-        with FoxgloveServer(
-            path.name, namespace=namespace, host=host, port=port, controls=clock, span=(clock.first, clock.last)
-        ) as server:
+        begin, finish = window(whole, options.start, options.end, path)
+        last = whole[1] if finish is None else min(finish, whole[1])
+        clock = player.Clock(begin or whole[0], last, speed=options.speed)
+        with options.server(path.name, namespace, clock, (clock.first, last)) as server:
             _say_where(server)
 
             def show(recorded: Recorded) -> None:
@@ -139,26 +132,17 @@ def _play(
     out.print(f"shown: {plural(server.shown, 'message')}")
 
 
-def _follow(host: str, port: int, words: list[str] | None, name: str | None, wait: float) -> None:
+def _follow(options: FoxgloveOptions) -> None:
     from dataflow.client.attach import graph_of, still_runs, tap
     from dataflow.client.playback import steering
-    from dataflow.foxglove.server import FoxgloveServer
 
-    found = running_graph(name, wait)
+    found = options.which.found()
     running = graph_of(found)
-    chosen = chosen_streams(words, running.streams, running.namespace)
+    chosen = chosen_streams(options.streams, running.streams, running.namespace)
     with ExitStack() as stack:
         bar = _bar(stack.enter_context(steering(found)))
-        server = stack.enter_context(
-            FoxgloveServer(
-                running.name,
-                namespace=running.namespace,
-                host=host,
-                port=port,
-                controls=bar,
-                span=None if bar is None else bar.span,
-            )
-        )
+        span_of_bar = None if bar is None else bar.span
+        server = stack.enter_context(options.server(running.name, running.namespace, bar, span_of_bar))
         _say_where(server)
         say_followed(found)
         if bar is not None:
@@ -166,7 +150,7 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
             stack.enter_context(_told(server, bar))
         clock = 0
         try:
-            with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
+            with tap(found, [f"/{stream}" for stream in chosen] if options.streams else ["**"]) as client:
                 while (taken := client.take(timeout=0.5)) is not None or still_runs(found):
                     message = None if taken is None else taken.decode().message
                     if taken is None or message is None:
@@ -185,7 +169,7 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
 def _bar(steering: Steering) -> ReplayBar | None:
     """Finds what a playback bar moves, where a recording is played through the graph; None elsewhere."""
     from dataflow.client.attach import NotRunning
-    from dataflow.client.replay_bar import ReplayBar
+    from dataflow.client.playback import ReplayBar
 
     try:
         standing = steering.ask(None)

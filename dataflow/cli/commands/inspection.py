@@ -11,8 +11,9 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, find_modules_in, graph_file
-from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say, table
+from dataflow.cli.support.arguments import GraphFile, Json, ModuleFolders, Settings, find_modules_in, graph_file
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, fail, out, plural, print_json, say, table
 from dataflow.text import visible_lines
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def check(
-    graphs: Annotated[list[Path], typer.Argument(metavar="GRAPH...", help="Graph files (.yaml).")],
+    graphs: Annotated[list[Path], argument("GRAPH...", "Graph files (.yaml).")],
     settings: Settings = None,
     path: ModuleFolders = None,
     json: Json = False,
@@ -43,18 +44,15 @@ def check(
     graphs = [graph_file(file) for file in graphs]
     find_modules_in(path)
     for file in graphs:
-        with friendly_errors():
-            try:
-                graph = load_graph(file, settings=settings or ())
-            except GraphError as error:
-                faults += error.problems
-                faulty += 1
-                if not json:
-                    out.print(
-                        Text.assemble(("faults", "bold red"), f"  {file}: {plural(len(error.problems), 'fault')}")
-                    )
-                    out.print(Text(str(error)), soft_wrap=True)
-                continue
+        try:
+            graph = load_graph(file, settings=settings or ())
+        except GraphError as error:
+            faults += error.problems
+            faulty += 1
+            if not json:
+                out.print(Text.assemble(("faults", "bold red"), f"  {file}: {plural(len(error.problems), 'fault')}"))
+                out.print(Text(str(error)), soft_wrap=True)
+            continue
         if not json:
             what = f"{plural(len(graph.nodes), 'operator')}, {plural(len(graph.streams), 'stream')}"
             out.print(Text.assemble(("ok", "green"), f"  {file}: {what}"), soft_wrap=True)
@@ -70,7 +68,7 @@ def show(
     graph: GraphFile,
     settings: Settings = None,
     path: ModuleFolders = None,
-    mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
+    mermaid: Annotated[bool, option("--mermaid", "Print a Mermaid flowchart.")] = False,
     json: Json = False,
 ) -> None:
     """Show a graph: processes, operators, what each takes and makes.
@@ -83,24 +81,20 @@ def show(
     """
     from dataflow.graph import draw, load_graph
 
-    with friendly_errors():
-        if json and mermaid:
-            raise fail("--json and --mermaid exclude each other")
-        find_modules_in(path)
-        loaded = load_graph(graph_file(graph), settings=settings or ())
-        if json:
-            print_json(loaded.to_json())
-        elif mermaid:
-            print(visible_lines(draw.mermaid(loaded)))
-        else:
-            out.print(draw.tree(loaded))
+    if json and mermaid:
+        raise fail("--json and --mermaid exclude each other")
+    find_modules_in(path)
+    loaded = load_graph(graph_file(graph), settings=settings or ())
+    if json:
+        print_json(loaded.to_json())
+    elif mermaid:
+        print(visible_lines(draw.mermaid(loaded)))
+    else:
+        out.print(draw.tree(loaded))
 
 
 def operators(
-    name: Annotated[
-        str | None,
-        typer.Argument(metavar="NAME", help="One operator: its ports, parameters and documentation."),
-    ] = None,
+    name: Annotated[str | None, argument("NAME", "One operator: its ports, parameters and documentation.")] = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -114,23 +108,22 @@ def operators(
     """
     from dataflow.graph import catalogue
 
-    with friendly_errors():
-        find_modules_in(path)
-        if name is None:
-            found = catalogue.discover()
-            if json:
-                print_json(found.to_json())
-            else:
-                _print_operators(found)
-            return
-        try:
-            described = catalogue.look_up(name)
-        except LookupError as error:
-            raise fail(str(error.args[0])) from None
+    find_modules_in(path)
+    if name is None:
+        found = catalogue.discover()
         if json:
-            print_json(described.to_json())
+            print_json(found.to_json())
         else:
-            out.print(catalogue.page(described))
+            _print_operators(found)
+        return
+    try:
+        described = catalogue.look_up(name)
+    except LookupError as error:
+        raise fail(str(error.args[0])) from None
+    if json:
+        print_json(described.to_json())
+    else:
+        out.print(catalogue.page(described))
 
 
 def _print_operators(found: Catalogue) -> None:
@@ -148,7 +141,7 @@ def _print_operators(found: Catalogue) -> None:
 
 
 def messages(
-    name: Annotated[str | None, typer.Argument(metavar="TYPE", help="One type: its fields, units and shapes.")] = None,
+    name: Annotated[str | None, argument("TYPE", "One type: its fields, units and shapes.")] = None,
     path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
@@ -167,22 +160,21 @@ def messages(
     """
     from dataflow.messages import message_types
 
-    with friendly_errors():
-        find_modules_in(path)
-        types = dict(sorted(message_types().items()))
-        if name is None:
-            if json:
-                print_json({schema: _first_line(kind) for schema, kind in types.items()})
-                return
-            made = table("type", "what it is")
-            for schema, kind in types.items():
-                made.add_row(Text(schema), Text(_first_line(kind)))
-            out.print(made)
+    find_modules_in(path)
+    types = dict(sorted(message_types().items()))
+    if name is None:
+        if json:
+            print_json({schema: _first_line(kind) for schema, kind in types.items()})
             return
-        if name not in types:
-            close = [schema for schema in types if name.lower() in schema.lower() or schema.lower() in name.lower()]
-            raise fail(f"there is no message type {name!r}; there are {', '.join(close or types)}")
-        described = _described(types[name])
+        made = table("type", "what it is")
+        for schema, kind in types.items():
+            made.add_row(Text(schema), Text(_first_line(kind)))
+        out.print(made)
+        return
+    if name not in types:
+        close = [schema for schema in types if name.lower() in schema.lower() or schema.lower() in name.lower()]
+        raise fail(f"there is no message type {name!r}; there are {', '.join(close or types)}")
+    described = _described(types[name])
     if json:
         print_json(described)
         return

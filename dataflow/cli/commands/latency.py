@@ -6,24 +6,14 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from dataflow.cli.support.arguments import (
-    Json,
-    ModuleFolders,
-    RecordingFile,
-    existing_recording,
-    find_modules_in,
-)
-from dataflow.cli.support.output import count, fail, friendly_errors, out, print_json, table
+from dataflow.cli.support.arguments import Json, ModuleFolders, RecordingFile, existing_recording, find_modules_in
+from dataflow.cli.support.output import count, fail, out, print_json, table
 
 if TYPE_CHECKING:
     from dataflow.analysis.latency import PathLatency
 
 
-def latency(
-    recording: RecordingFile,
-    folders: ModuleFolders = None,
-    json: Json = False,
-) -> None:
+def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json = False) -> None:
     """Print the latency of every path of a recorded run, from source to sink.
 
     The time runs from the moment a source gave a message to the end of the sink's firing that the message caused. It is
@@ -41,7 +31,7 @@ def latency(
     from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
     find_modules_in(folders)
-    with friendly_errors(), Recording(existing_recording(recording)) as opened:
+    with Recording(existing_recording(recording)) as opened:
         if not opened.firing_batches():
             raise fail(
                 f"{recording} holds no firing records, from which latencies are computed: `dataflow run --record` and "

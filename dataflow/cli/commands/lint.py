@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.arguments import (
-    FLAG,
-    AnyRecording,
-    Json,
-    Overwrite,
-    existing,
-    existing_recording,
-    output_file,
-)
-from dataflow.cli.support.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, shown, table
+from dataflow.cli.support.arguments import AnyRecording, Json, Overwrite, existing, existing_recording, output_file
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import DIFFERENT, count, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
     from dataflow.lint.inputs import LintInput
@@ -31,16 +24,12 @@ _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 def lint(
     recording: AnyRecording,
     contract: Annotated[
-        Path | None,
-        typer.Option("--contract", metavar="FILE.yaml", help="What the recording has to hold, kept with your code."),
+        Path | None, option("--contract FILE.yaml", "What the recording has to hold, kept with your code.")
     ] = None,
     write: Annotated[
-        Path | None,
-        typer.Option("--write-contract", metavar="FILE.yaml", help="Write a contract that this recording keeps."),
+        Path | None, option("--write-contract FILE.yaml", "Write a contract that this recording keeps.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", metavar=FLAG, help="Leave the clocks out, for which images are decoded.")
-    ] = False,
+    quick: Annotated[bool, option("--quick", "Leave the clocks out, for which images are decoded.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -64,23 +53,19 @@ def lint(
       dataflow lint run.mcap --contract robot.yaml --json
       dataflow lint rosbag2_folder --quick
     """
-    from dataflow.lint.contract import ContractError, load_contract, proposed
+    from dataflow.lint.contract import load_contract, proposed
     from dataflow.lint.look import lint as look
 
-    with friendly_errors():
+    if write is not None:
+        output_file(write, ".yaml", overwrite=overwrite, option="--write-contract")
+    terms = None if contract is None else load_contract(existing(contract, "a contract"))
+    with _input(existing_recording(recording)) as data:
+        report = look(data, terms, clocks=not quick)
+        shown(finding.text for finding in report.findings)
         if write is not None:
-            output_file(write, ".yaml", overwrite=overwrite, option="--write-contract")
-        try:
-            terms = None if contract is None else load_contract(existing(contract, "a contract"))
-        except ContractError as error:
-            raise fail(str(error)) from None
-        with _input(existing_recording(recording)) as data:
-            report = look(data, terms, clocks=not quick)
-            shown(finding.text for finding in report.findings)
-            if write is not None:
-                name, namespace = recording.stem, data.namespace
-                text = proposed(name, namespace, data.streams, report.timings, report.root)
-                write.write_text(text, encoding="utf-8")
+            name, namespace = recording.stem, data.namespace
+            text = proposed(name, namespace, data.streams, report.timings, report.root)
+            write.write_text(text, encoding="utf-8")
     if json:
         print_json(report.to_json())
     else:

@@ -5,30 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from dataflow.cli.support.arguments import ModuleFolders, find_modules_in
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import fail, say
 
-from dataflow.cli.support.arguments import FLAG, ModuleFolders, find_modules_in
-from dataflow.cli.support.output import fail, friendly_errors, say
-
-Connect = Annotated[
-    str, typer.Option("--connect", metavar="ENDPOINT", help="Where the run listens (`dataflow run --listen`).")
-]
-Authority = Annotated[Path, typer.Option("--authority", metavar="FOLDER", help="The folder of `dataflow keys new`.")]
+Connect = Annotated[str, option("--connect ENDPOINT", "Where the run listens (`dataflow run --listen`).")]
+Authority = Annotated[Path, option("--authority FOLDER", "The folder of `dataflow keys new`.")]
 
 
 def join(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
+    name: Annotated[str, argument("NAME", "This machine's name in graphs (`machine:`).")],
     connect: Connect,
-    keys: Annotated[Path | None, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")] = None,
-    folder: Annotated[
-        Path, typer.Option("--folder", metavar="FOLDER", help="Where operators run, and files that are sent lie.")
-    ] = Path("dataflow-agent"),
+    keys: Annotated[Path | None, option("--keys FOLDER", "This machine's keys.")] = None,
+    folder: Annotated[Path, option("--folder FOLDER", "Where operators run, and files that are sent lie.")] = Path(
+        "dataflow-agent"
+    ),
     path: ModuleFolders = None,
     timeout: Annotated[
-        float,
-        typer.Option("--timeout", metavar="SECONDS", help="Operators go on for so long without the supervisor."),
+        float, option("--timeout SECONDS", "Operators go on for so long without the supervisor.")
     ] = 30.0,
-    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="End after one run.")] = False,
+    once: Annotated[bool, option("--once", "End after one run.")] = False,
 ) -> None:
     """Let this machine take part in graphs that run elsewhere.
 
@@ -46,18 +42,15 @@ def join(
     from dataflow.supervision.agent import Agent
 
     find_modules_in(path)
-    with friendly_errors():
-        if keys is not None:
-            require_machine(keys, name)
-        agent = Agent(name, connect, keys, folder, say, patience=timeout)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: agent.stop())
-        agent.run(once=once)
+    if keys is not None:
+        require_machine(keys, name)
+    agent = Agent(name, connect, keys, folder, say, patience=timeout)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: agent.stop())
+    agent.run(once=once)
 
 
-def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make.")],
-) -> None:
+def new(folder: Annotated[Path, argument("FOLDER", "The folder to make.")]) -> None:
     """Make an authority, which issues keys. Its folder stays where it is: who has it can issue keys.
 
     Examples:
@@ -66,20 +59,18 @@ def new(
     """
     from dataflow.machines.keys import new_authority
 
-    with friendly_errors():
-        new_authority(folder)
+    new_authority(folder)
     say(f"{folder} issues keys: dataflow keys add NAME --authority {folder}")
 
 
 def add(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The machine's name, and that of the folder to make.")],
+    name: Annotated[str, argument("NAME", "The machine's name, and that of the folder to make.")],
     authority: Authority,
     serves: Annotated[
-        list[str] | None,
-        typer.Option("--serves", metavar="ADDRESS", help="Graphs are run there, and others reach it by this address."),
+        list[str] | None, option("--serves ADDRESS", "Graphs are run there, and others reach it by this address.")
     ] = None,
-    tools: Annotated[bool, typer.Option("--tools", metavar=FLAG, help="Keys for tools alone, on any machine.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Another folder than NAME.")] = None,
+    tools: Annotated[bool, option("--tools", "Keys for tools alone, on any machine.")] = False,
+    out: Annotated[Path | None, option("--out FOLDER", "Another folder than NAME.")] = None,
 ) -> None:
     """Make the keys of one machine, in a folder to be taken there.
 
@@ -97,6 +88,5 @@ def add(
     if tools and serves:
         raise fail("--tools and --serves exclude each other: tools only connect")
     folder = out or Path(name)
-    with friendly_errors():
-        issue(authority, folder, TOOLS if tools else name, serves=serves or ())
+    issue(authority, folder, TOOLS if tools else name, serves=serves or ())
     say(f"{folder}: the keys of {'tools' if tools else f'machine {name!r}'}")

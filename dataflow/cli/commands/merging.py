@@ -11,29 +11,19 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.support.arguments import Json, Overwrite, existing, output_file
-from dataflow.cli.support.material import (
-    Compression,
-    Out,
-    Quiet,
-    copying,
-    opened_material,
-    refuse_itself,
-    tell_edited,
-)
-from dataflow.cli.support.output import count, fail, friendly_errors, out, plural, print_json, say, shown, size, table
+from dataflow.cli.support.edited_files import Compression, Out, Quiet, copying, opened_file, refuse_itself, tell_edited
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import count, fail, out, plural, print_json, say, shown, size, table
 
 if TYPE_CHECKING:
     from dataflow.editing.recover import Recovered
 
 
 def merge(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="A B ...", help="Recordings, or other MCAP files: two or more.")
-    ],
+    recordings: Annotated[list[Path], argument("A B ...", "Recordings, or other MCAP files: two or more.")],
     output: Out,
     prefix: Annotated[
-        list[str] | None,
-        typer.Option("--prefix", metavar="FILE=NAME/", help="Put NAME/ before the streams of FILE. May be repeated."),
+        list[str] | None, option("--prefix FILE=NAME/", "Put NAME/ before the streams of FILE. May be repeated.")
     ] = None,
     compression: Compression = "zstd",
     overwrite: Overwrite = False,
@@ -65,7 +55,7 @@ def merge(
     from dataflow.editing.merge import merge as merge_all
     from dataflow.recording.streams.part_folder import NOTHING_IN_IT
 
-    with friendly_errors(), ExitStack() as stack:
+    with ExitStack() as stack:
         if len(recordings) < 2:
             raise fail("nothing to merge: name two recordings or more")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
@@ -73,7 +63,7 @@ def merge(
         empty = [path for path in recordings if path.is_file() and not path.stat().st_size]
         recordings = [path for path in recordings if path not in empty]
         prefixes = _prefixes(prefix or (), recordings)
-        origins = [stack.enter_context(opened_material(path)) for path in recordings]
+        origins = [stack.enter_context(opened_file(path)) for path in recordings]
         watch = stack.enter_context(copying("merging", quiet or json))
         done = merge_all(origins, output, prefixes=prefixes, compression=compression, overwrite=overwrite, watch=watch)
         done.notes += [f"{path} {NOTHING_IN_IT}" for path in empty]
@@ -98,7 +88,7 @@ def _prefixes(words: Sequence[str], recordings: Sequence[Path]) -> list[str]:
 
 
 def recover(
-    recording: Annotated[Path, typer.Argument(metavar="BROKEN", help="A torn or damaged MCAP file, .db3 or .bag.")],
+    recording: Annotated[Path, argument("BROKEN", "A torn or damaged MCAP file, .db3 or .bag.")],
     output: Out,
     compression: Compression = "zstd",
     overwrite: Overwrite = False,
@@ -129,7 +119,7 @@ def recover(
     from dataflow.interop.opening import is_ros_bag
     from dataflow.recording.mcap.index import NO_END
 
-    with friendly_errors(), copying("recovering", quiet or json) as watch:
+    with copying("recovering", quiet or json) as watch:
         existing(recording, "a recording")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         if is_ros_bag(recording):

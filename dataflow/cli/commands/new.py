@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
-import typer
 from rich.text import Text
 
 from dataflow.cli.commands.machines import Connect
 from dataflow.cli.support.arguments import GraphFile, Json, find_modules_in
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, out, print_json
 from dataflow.cli.support.run_options import Keys, Listen, machines_of
 
 HERE = Path()
-Made = TypeVar("Made")
-User = Annotated[str | None, typer.Option("--user", metavar="USER", help="Who runs it; by default you.")]
-To = Annotated[
-    Path, typer.Option("--to", "--out", "-o", metavar="DIR", help="The folder to write into; made where it is missing.")
-]
+User = Annotated[str | None, option("--user USER", "Who runs it; by default you.")]
+To = Annotated[Path, option("--to --out -o DIR", "The folder to write into; made where it is missing.")]
 
 
 def operator(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as NearestObstacle.")],
+    name: Annotated[str, argument("NAME", "Such as NearestObstacle.")],
     kind: Annotated[
         str,
-        typer.Option(
-            "--kind",
-            metavar="KIND",
-            help="operator: fires for each message; timer: at each tick of event time; source: reads a device; "
+        option(
+            "--kind KIND",
+            "operator: fires for each message; timer: at each tick of event time; source: reads a device; "
             "program: is written in C++.",
         ),
     ] = "operator",
@@ -53,19 +49,15 @@ def operator(
         raise fail(f"--kind {kind}: expected one of {', '.join(KINDS)}")
     chosen = next(known for known in KINDS if known == kind)
     package = _package(to)
-    files = _named(lambda: operator_files(name, chosen, package))
+    files = operator_files(name, chosen, package)
     tests = to.resolve().parents[package.count(".")] / "tests" if package else to
     placed = {(tests if file.name.startswith("test_") else to) / file: text for file, text in files.items()}
-    module = _named(lambda: snake(name))
+    module = snake(name)
     hints = (f"run its test: pytest {_shown(tests / f'test_{module}.py')}",)
     _write(placed, hints, json=json)
 
 
-def graph(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as obstacle_watch.")],
-    to: To = HERE,
-    json: Json = False,
-) -> None:
+def graph(name: Annotated[str, argument("NAME", "Such as obstacle_watch.")], to: To = HERE, json: Json = False) -> None:
     """Begin a graph file: a synthetic camera and the clouds of what it sees. It runs as it is.
 
     Examples:
@@ -75,12 +67,12 @@ def graph(
     """
     from dataflow.scaffold.files import graph_files
 
-    files = {to / file: text for file, text in _named(lambda: graph_files(name)).items()}
+    files = {to / file: text for file, text in graph_files(name).items()}
     _write(files, (f"run it: dataflow run {_shown(next(iter(files)))}",), json=json)
 
 
 def project(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as my_robot: the folder and its package.")],
+    name: Annotated[str, argument("NAME", "Such as my_robot: the folder and its package.")],
     to: To = HERE,
     json: Json = False,
 ) -> None:
@@ -93,27 +85,21 @@ def project(
     """
     from dataflow.scaffold.files import project_files, snake
 
-    made = _named(lambda: project_files(name))
+    made = project_files(name)
     folder = to.expanduser() / name
     if folder.exists() and any(folder.iterdir()):
         raise fail(f"{folder} is there already, and not empty; choose another name or folder")
-    package = _named(lambda: snake(name))
+    package = snake(name)
     hints = (f"run its tests and its graph: cd {_shown(folder)} && pytest && dataflow run graphs/{package}.yaml",)
     _write({folder / file: text for file, text in made.items()}, hints, json=json)
 
 
 def service(
     graph: GraphFile,
-    name: Annotated[
-        str | None, typer.Option("--name", metavar="NAME", help="Of the service; by default that of the graph.")
-    ] = None,
+    name: Annotated[str | None, option("--name NAME", "Of the service; by default that of the graph.")] = None,
     user: User = None,
-    keep_disk: Annotated[
-        str, typer.Option("--keep-disk", metavar="SIZE", help="Bytes of recordings that a run keeps.")
-    ] = "20GB",
-    days: Annotated[
-        int, typer.Option("--days", metavar="N", help="Days after which recordings are deleted.", min=1)
-    ] = 14,
+    keep_disk: Annotated[str, option("--keep-disk SIZE", "Bytes of recordings that a run keeps.")] = "20GB",
+    days: Annotated[int, option("--days N", "Days after which recordings are deleted.", min=1)] = 14,
     listen: Listen = None,
     keys: Keys = None,
     to: To = HERE,
@@ -135,15 +121,13 @@ def service(
     import sys
 
     from dataflow.cli.support.arguments import graph_file
-    from dataflow.cli.support.output import friendly_errors
     from dataflow.graph import load_graph
     from dataflow.scaffold.files import service_files
 
     file = graph_file(graph)
     find_modules_in(None)
-    with friendly_errors():
-        loaded = load_graph(file, live=True)
-        machines_of(loaded, listen, keys, here=False, begins=False)
+    loaded = load_graph(file, live=True)
+    machines_of(loaded, listen, keys, here=False, begins=False)
     away = sorted({node.machine for node in loaded.nodes.values() if node.machine is not None})
     if away and listen is None:
         raise fail(f"operators run on {', '.join(away)}: give --listen, where they join, and --keys")
@@ -155,15 +139,15 @@ def service(
         command += ["--record", "out/{time}.mcap", "--split-every", "10min", "--keep-disk", keep_disk]
     kept = folder / (flight.folder if flight is not None else "out")
     wanted, who = name or loaded.name, user or getpass.getuser()
-    files = _named(lambda: service_files(wanted, command, folder=folder, out=kept, user=who, days=days))
+    files = service_files(wanted, command, folder=folder, out=kept, user=who, days=days)
     hints = (f"check it: systemd-analyze verify {_shown(to / f'{wanted}.service')}", "install it as its head describes")
     _write({to / made: text for made, text in files.items()}, hints, json=json)
 
 
 def agent(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="This machine's name in graphs (`machine:`).")],
+    name: Annotated[str, argument("NAME", "This machine's name in graphs (`machine:`).")],
     connect: Connect,
-    keys: Annotated[Path, typer.Option("--keys", metavar="FOLDER", help="This machine's keys.")],
+    keys: Annotated[Path, option("--keys FOLDER", "This machine's keys.")],
     user: User = None,
     to: To = HERE,
     json: Json = False,
@@ -179,29 +163,17 @@ def agent(
     import getpass
     import sys
 
-    from dataflow.cli.support.output import friendly_errors
     from dataflow.machines.keys import require_machine, settings
     from dataflow.scaffold.files import agent_files
 
-    with friendly_errors():
-        settings(keys, connect)
-        require_machine(keys, name)
+    settings(keys, connect)
+    require_machine(keys, name)
     command = [str(Path(sys.executable).with_name("dataflow")), "join", name, "--connect", connect]
     command += ["--keys", str(keys.resolve()), "--folder", str(Path("dataflow-agent").resolve())]
-    files = _named(lambda: agent_files(name, command, folder=Path.cwd(), user=user or getpass.getuser()))
+    files = agent_files(name, command, folder=Path.cwd(), user=user or getpass.getuser())
     unit = to / f"dataflow-{name}.service"
     hints = (f"check it: systemd-analyze verify {_shown(unit)}", "install it as its head describes")
     _write({to / made: text for made, text in files.items()}, hints, json=json)
-
-
-def _named(make: Callable[[], Made]) -> Made:
-    """Ends the command where a name cannot be."""
-    from dataflow.scaffold.files import NameFault
-
-    try:
-        return make()
-    except NameFault as fault:
-        raise fail(str(fault)) from None
 
 
 def _package(folder: Path) -> str:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json, number
-from dataflow.cli.support.output import err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.support.options import argument
+from dataflow.cli.support.output import err, fail, out, print_json, say
 from dataflow.cli.support.quantities import speed_text
 
 if TYPE_CHECKING:
@@ -132,19 +132,16 @@ def _do(key: Pressed, supervisor: Supervisor) -> None:
 
 
 def playback(
-    action: Annotated[
-        str, typer.Argument(metavar="pause|resume|step|speed|status", help="What to do; status prints the state.")
-    ],
+    action: Annotated[str, argument("pause|resume|step|speed|status", "What to do; status prints the state.")],
     value: Annotated[
         str | None,
-        typer.Argument(
-            metavar="N|FACTOR",
-            help="Of step: all messages of so many timestamps, by default 1. Of speed: 1 is real time, max as fast as "
+        argument(
+            "N|FACTOR",
+            "Of step: all messages of so many timestamps, by default 1. Of speed: 1 is real time, max as fast as "
             "the graph goes.",
         ),
     ] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Pause, resume, step or pace what runs in another terminal, or in a script.
@@ -173,9 +170,8 @@ def playback(
     if action not in ACTIONS:
         raise fail(f"{action!r}: expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")
     steps, speed = _wanted(action, value)
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        answer = ask(found, None if action == "status" else action, steps, speed)
+    found = which.found()
+    answer = ask(found, None if action == "status" else action, steps, speed)
     if json:
         print_json(answer)
         return

@@ -9,12 +9,13 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, AnyRecording, Json, Streams, existing_recording
+from dataflow.cli.support.arguments import AnyRecording, Json, Streams, existing_recording
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import (
     DIFFERENT,
     count,
+    facts_table,
     fail,
-    friendly_errors,
     out,
     plural,
     print_json,
@@ -23,10 +24,9 @@ from dataflow.cli.support.output import (
     size,
     table,
 )
-from dataflow.text import visible
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from dataflow.recording.streams.diff import DiffReport
     from dataflow.recording.streams.info import Description
@@ -34,12 +34,8 @@ if TYPE_CHECKING:
 
 def info(
     recording: AnyRecording,
-    digests: Annotated[
-        bool, typer.Option("--digests", metavar=FLAG, help="Read everything and print each stream's digest.")
-    ] = False,
-    metadata: Annotated[
-        bool, typer.Option("--metadata", metavar=FLAG, help="Print all metadata: parameters, versions, machine.")
-    ] = False,
+    digests: Annotated[bool, option("--digests", "Read everything and print each stream's digest.")] = False,
+    metadata: Annotated[bool, option("--metadata", "Print all metadata: parameters, versions, machine.")] = False,
     json: Json = False,
 ) -> None:
     """Describe a recording: streams, types, counts, rates, what made it.
@@ -61,13 +57,12 @@ def info(
     from dataflow.recording.mcap.index import NO_END
     from dataflow.recording.streams.info import describe
 
-    with friendly_errors():
-        if is_foreign(existing_recording(recording)):
-            if digests:
-                raise fail("--digests is of recordings; messages of a bag have none")
-            describe_bag(recording, metadata=metadata, json=json)
-            return
-    with friendly_errors(), Recording(recording) as opened:
+    if is_foreign(existing_recording(recording)):
+        if digests:
+            raise fail("--digests is of recordings; messages of a bag have none")
+        describe_bag(recording, metadata=metadata, json=json)
+        return
+    with Recording(recording) as opened:
         described = describe(opened)
         shown([NO_END, *described.damage])
         computed = dict(opened.digests()) if digests else None
@@ -75,7 +70,7 @@ def info(
         print_json(described.as_json() | ({} if computed is None else {"digests": computed}))
         return
     namespace = described.metadata.get(RECORDING, {}).get("namespace", "")
-    out.print(_facts(described))
+    out.print(facts_table(_facts(described)))
     out.print(_streams(described, namespace))
     if silent := _silent(described, namespace):
         out.print(Text(silent, style="dim"))
@@ -88,62 +83,55 @@ def info(
             out.print(_mapping(record, values))
 
 
-def _facts(described: Description) -> Table:
+def _facts(described: Description) -> Iterator[tuple[str, str, str]]:
+    """Yields name, value and style of each fact about a whole recording."""
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.recording.mcap.attachments import tells_of_run
     from dataflow.recording.streams.cutting import cut_of, triggers_of
     from dataflow.recording.streams.facts import group_of
     from dataflow.sync.stamps import format_stamp
 
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(style="dim", no_wrap=True)
-    grid.add_column(overflow="fold")
-
-    def row(name: str, value: str, style: str = "") -> None:
-        grid.add_row(name, Text(visible(value), style=style))
-
     made = described.metadata
     uncompressed = sum(s.bytes for s in described.streams)
-    row("file", described.path)
-    row("size", f"{size(described.bytes)}, {size(uncompressed)} uncompressed")
-    row("written by", described.library + (f", profile {described.profile}" if described.profile else ""))
+    yield "file", described.path, ""
+    yield "size", f"{size(described.bytes)}, {size(uncompressed)} uncompressed", ""
+    yield "written by", described.library + (f", profile {described.profile}" if described.profile else ""), ""
     if GRAPH in made:
-        row("graph", f"{made[GRAPH].get('name', '')}, namespace {made.get(RECORDING, {}).get('namespace', '')}")
+        yield "graph", f"{made[GRAPH].get('name', '')}, namespace {made.get(RECORDING, {}).get('namespace', '')}", ""
     if RUN in made:
-        row("made by", _made_by(made[RUN]))
+        yield "made by", _made_by(made[RUN]), ""
     for record, machine in sorted(made.items()):
         group, of = group_of(record)
         if group == "machine":
             what = f"{machine.get('cpu', '')}, {machine.get('cores', '?')} cores, {machine.get('os', '')}"
-            row(f"machine {of}".rstrip(), what)
+            yield f"machine {of}".rstrip(), what, ""
     if OUTCOME in made:
         outcome = made[OUTCOME].get("outcome", "")
-        row("outcome", outcome, "" if outcome == "complete" else "yellow")
+        yield "outcome", outcome, "" if outcome == "complete" else "yellow"
     if (part := cut_of(made)) is not None:
         ends = [f"{word} {format_stamp(s)}" for word, s in (("from", part.start), ("to", part.end)) if s is not None]
-        row("part of", " ".join([part.of, *ends]))
+        yield "part of", " ".join([part.of, *ends]), ""
     for why in triggers_of(made):
-        row("kept because", why)
+        yield "kept because", why, ""
     if RECOVERED in made:
-        row("recovered", f"from {made[RECOVERED].get('of', '')}: what could be read of it", "yellow")
+        yield "recovered", f"from {made[RECOVERED].get('of', '')}: what could be read of it", "yellow"
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
         torn = "no proper end: it is being written, or its writer died"
-        row("torn", torn + (lost if described.lost_bytes else ""), "yellow")
+        yield "torn", torn + (lost if described.lost_bytes else ""), "yellow"
     for note in described.damage:
-        row("damaged", note, "yellow")
+        yield "damaged", note, "yellow"
     if described.start is not None and described.end is not None:
-        row("from", format_stamp(described.start))
-        row("to", format_stamp(described.end))
-        row("duration", seconds(described.duration * 1e-9))
-    row("messages", count(described.messages))
+        yield "from", format_stamp(described.start), ""
+        yield "to", format_stamp(described.end), ""
+        yield "duration", seconds(described.duration * 1e-9), ""
+    yield "messages", count(described.messages), ""
     if described.firings:
-        row("firings of", ", ".join(described.firings))
+        yield "firings of", ", ".join(described.firings), ""
     for each in described.attachments:
-        row("attachment", ", ".join(part for part in (each.name, each.media_type, size(each.bytes)) if part))
+        yield "attachment", ", ".join(part for part in (each.name, each.media_type, size(each.bytes)) if part), ""
     if told := [name for name in made if not tells_of_run(name)]:
-        row("metadata", f"{', '.join(told)} (--metadata prints it)")
-    return grid
+        yield "metadata", f"{', '.join(told)} (--metadata prints it)", ""
 
 
 def _made_by(run: Mapping[str, str]) -> str:
@@ -184,25 +172,17 @@ def _relative(stream: str, namespace: str) -> str:
 
 
 def _mapping(title: str, values: Mapping[str, Any]) -> Table:
-    made = Table.grid(padding=(0, 2))
-    made.title, made.title_justify, made.title_style = title, "left", "bold"
-    made.add_column(style="dim", overflow="fold")
-    made.add_column(overflow="fold")
-    for key, value in values.items():
-        text = str(value)
-        lines = text.splitlines()
-        short = text if len(lines) <= 1 else f"{plural(len(lines), 'line')}: {lines[0]}"
-        made.add_row(Text(key), Text(short))
-    return made
+    lines = {key: str(value).splitlines() or [""] for key, value in values.items()}
+    short = {key: of[0] if len(of) == 1 else f"{plural(len(of), 'line')}: {of[0]}" for key, of in lines.items()}
+    return facts_table(((key, value, "") for key, value in short.items()), title)
 
 
 def diff(
-    a: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    a: Annotated[Path, argument("A", "A recording.")],
+    b: Annotated[Path, argument("B", "Another one.")],
     streams: Streams = None,
     tolerance: Annotated[
-        float | None,
-        typer.Option("--tolerance", metavar="X", help="Decimal numbers may differ by so much. Default: bit for bit."),
+        float | None, option("--tolerance X", "Decimal numbers may differ by so much. Default: bit for bit.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -222,7 +202,6 @@ def diff(
     from dataflow.recording.streams.diff import diff as compare
 
     with (
-        friendly_errors(),
         Recording(existing_recording(a)) as first,
         Recording(existing_recording(b)) as second,
     ):

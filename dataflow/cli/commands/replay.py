@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,15 +14,13 @@ from rich.markup import escape
 from dataflow.cli.commands.playback import keys, looped
 from dataflow.cli.support.arguments import (
     AnyRecording,
-    Clock,
+    BagOptions,
     End,
-    Map,
     ModuleFolders,
     Network,
     OtherGraph,
     OtherSettings,
     Start,
-    Strict,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -31,26 +30,20 @@ from dataflow.cli.support.arguments import (
     window,
 )
 from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
-from dataflow.cli.support.output import DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import DIFFERENT, err, fail, out, print_json, say
 from dataflow.cli.support.run_options import (
-    OUTPUT,
-    Compression,
-    Json,
-    OneProcess,
-    Open,
+    TIMEOUT,
     Paranoid,
-    Place,
-    ProcessEach,
-    Quiet,
+    PlacementOptions,
     Rate,
-    Record,
     Replace,
+    ReportOptions,
     Step,
     Timeout,
-    Verbose,
-    View,
+    ViewOptions,
 )
-from dataflow.cli.support.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
+from dataflow.cli.support.storage import OUTPUT, RecordOptions
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -58,50 +51,38 @@ if TYPE_CHECKING:
     from dataflow.supervision.core.report import RunReport, Watch
 
 
-def replay(
-    recording: AnyRecording,
-    graph: OtherGraph = None,
-    maps: Map = None,
-    clock: Clock = "auto",
-    strict: Strict = False,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
-    start: Start = None,
-    end: End = None,
-    rate: Rate = None,
-    step: Step = False,
-    loop: Annotated[
-        int, typer.Option("--loop", metavar="N", help="Replay N times, and compare the passes; 0: until Ctrl-C.")
-    ] = 1,
-    timeout: Timeout = 120.0,
-    paranoid: Paranoid = False,
-    network: Network = False,
-    quiet: Quiet = False,
-    one_process: OneProcess = False,
-    process_each: ProcessEach = False,
-    place: Place = None,
-    record: Record = None,
-    compression: Compression = None,
-    split_every: SplitEvery = None,
-    split_size: SplitSize = None,
-    keep_disk: KeepDisk = None,
-    record_failure: OnFailure = None,
-    readable: Readable = "owner",
-    view: View = None,
-    open_view: Open = False,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayOptions:
+    """The options of `dataflow replay`, in the order of its help."""
+
+    graph: OtherGraph = None
+    bag: BagOptions
+    settings: OtherSettings = None
+    path: ModuleFolders = None
+    start: Start = None
+    end: End = None
+    rate: Rate = None
+    step: Step = False
+    loop: Annotated[int, option("--loop N", "Replay N times, and compare the passes; 0: until Ctrl-C.")] = 1
+    timeout: Timeout = TIMEOUT
+    paranoid: Paranoid = False
+    network: Network = False
+    placed: PlacementOptions
+    recorded: RecordOptions
+    viewed: ViewOptions
     complete: Annotated[
         Path | None,
-        typer.Option(
-            "--complete",
-            metavar="FILE.mcap",
-            rich_help_panel=OUTPUT,
-            help="Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+        option(
+            "--complete FILE.mcap",
+            "Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+            OUTPUT,
         ),
-    ] = None,
-    overwrite: Replace = False,
-    verbose: Verbose = False,
-    json: Json = False,
-) -> None:
+    ] = None
+    overwrite: Replace = False
+    told: ReportOptions
+
+
+def replay(recording: AnyRecording, options: ReplayOptions) -> None:
     """Replay a recording through the graph that made it, or another one.
 
     Recorded streams replace the sources; everything else runs again, with identical results. Compare two recordings of
@@ -143,89 +124,78 @@ def replay(
     began = time.monotonic()
     from dataflow.supervision.early_nursery import early_nursery
 
-    with friendly_errors(), ExitStack() as stack:
-        existing_recording(recording)
-        if record is not None and record.exists() and record.samefile(recording):
-            raise fail(f"--record {record} is the recording that is being replayed; name another file")
-        _check_loop(loop, written=(record, view, complete) != (None,) * 3)
-        if graph is None and settings:
-            raise fail("--set changes a graph file: name it with --graph")
-        if compression is not None and record is None:
-            raise fail("--compression is of a recording: name one with --record")
-        storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable)
-        packing = {} if compression is None else {"compression": compression}
-        find_modules_in(path)
-        early = None if complete is not None else stack.enter_context(early_nursery())
+    with ExitStack() as stack:
+        _check(existing_recording(recording), options)
+        find_modules_in(options.path)
+        early = None if options.complete is not None else stack.enter_context(early_nursery())
         from dataflow.graph import load_graph
         from dataflow.interop.opening import is_foreign
-        from dataflow.recording import Recording
-        from dataflow.supervision.run import replay as replay_recording
 
-        def planned(loaded: Graph) -> tuple[Outputs, dict[str, Any]]:
-            outputs = checked_outputs(record, view, open_view, overwrite, storage)
-            options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-            return outputs, options | {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
-
-        given = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        if maps or is_foreign(recording):
-            from dataflow.cli.support.bags import replay_bag
-
-            given = _graph_of_bag(recording, given, completed=complete is not None)
-            outputs, options = planned(given)
-            _check_bag(loop, splits=storage.splitting.splits)
-            words = (recording, given, maps or (), clock, start, end, outputs, options)
-            replay_bag(*words, strict=strict, began=began, json=json, quiet=quiet, verbose=verbose)
-            return
-        with Recording(refuse_of_recording(recording, clock, strict=strict)) as opened:
-            loaded = _recorded_graph(opened, network=network) if given is None else given
-            if complete is not None:
-                others = (start, end, rate, record, view, place)
-                _check_complete(others != (None,) * 6 or any((open_view, one_process, process_each, paranoid)))
-                _complete(recording, loaded, complete, overwrite=overwrite, json=json, quiet=quiet)
-                return
-            shown = _shown(opened, loaded, start, end)
-        outputs, options = planned(loaded)
-
-        options |= {"graph": loaded, "start": start, "end": end}
-        told: dict[str, Any] = {"began": began, "json": json, "quiet": quiet, "verbose": verbose}
-
-        def playing(watch: Watch | None) -> RunReport:
-            return replay_recording(recording, watch=watch, **options)
-
-        looped(loop, lambda: dict(execute(playing, loaded, outputs, shown, **told).streams))
+        file, settings = options.graph, options.settings or ()
+        given = None if file is None else load_graph(graph_file(file), settings=settings)
+        if options.bag.maps or is_foreign(recording):
+            _replay_bag(recording, given, options, early, began)
+        else:
+            _replay_recording(recording, given, options, early, began)
 
 
-def _check_loop(loop: int, *, written: bool) -> None:
+def _check(recording: Path, options: ReplayOptions) -> None:
+    record, loop = options.recorded.record, options.loop
+    if record is not None and record.exists() and record.samefile(recording):
+        raise fail(f"--record {record} is the recording that is being replayed; name another file")
     if loop < 0:
         raise fail(f"--loop {loop}: expected 1 or more, or 0 for no end")
-    if loop != 1 and written:
+    if loop != 1 and (record, options.viewed.view, options.complete) != (None,) * 3:
         raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
+    if options.graph is None and options.settings:
+        raise fail("--set changes a graph file: name it with --graph")
+    options.recorded.storage()
 
 
-def _check_bag(loop: int, *, splits: bool) -> None:
-    if splits:
-        raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
-    if loop != 1:
-        raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
+def _planned(graph: Graph, options: ReplayOptions, early: Any) -> tuple[Outputs, dict[str, Any]]:
+    """The checked outputs and the fields of the `RunPlan`."""
+    outputs = checked_outputs(options.recorded, options.viewed, overwrite=options.overwrite)
+    plan = plan_options(
+        graph, outputs, options.placed, rate=options.rate, paranoid=options.paranoid, timeout=options.timeout
+    )
+    controls = keys(options.told.quiet or options.told.json)
+    return outputs, plan | {"early": early, "paused": options.step, "controls": controls}
 
 
-def _check_complete(others: bool) -> None:
-    if others:
-        raise fail(
-            "--complete repeats a run as it was, in one process: of the other options only --graph, "
-            "--set, --overwrite, --quiet and --json go with it"
-        )
-
-
-def _graph_of_bag(bag: Path, graph: Graph | None, *, completed: bool) -> Graph:
+def _replay_bag(bag: Path, graph: Graph | None, options: ReplayOptions, early: Any, began: float) -> None:
+    from dataflow.cli.support.bags import replay_bag
     from dataflow.interop.opening import open_bag
 
     if graph is None:
         open_bag(bag).close()
         raise fail(f"{bag} does not hold the graph that made it: name one with --graph")
-    if completed:
+    if options.complete is not None:
         raise fail("--complete needs the firing records of a run, which bags do not hold")
-    return graph
+    outputs, plan = _planned(graph, options, early)
+    if outputs.storage is not None and outputs.storage.splitting.splits:
+        raise fail("of a bag no split recording is made; split it afterwards: dataflow split FILE.mcap")
+    if options.loop != 1:
+        raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
+    replay_bag(bag, graph, options.bag, options.start, options.end, outputs, plan, options.told, began=began)
+
+
+def _replay_recording(recording: Path, given: Graph | None, options: ReplayOptions, early: Any, began: float) -> None:
+    from dataflow.recording import Recording
+    from dataflow.supervision.run import replay as replay_recording
+
+    with Recording(refuse_of_recording(recording, options.bag.clock, strict=options.bag.strict)) as opened:
+        graph = _recorded_graph(opened, network=options.network) if given is None else given
+        if options.complete is not None:
+            _complete(recording, graph, options.complete, options)
+            return
+        shown = _shown(opened, graph, options.start, options.end)
+    outputs, plan = _planned(graph, options, early)
+    plan |= {"graph": graph, "start": options.start, "end": options.end}
+
+    def playing(watch: Watch | None) -> RunReport:
+        return replay_recording(recording, watch=watch, **plan)
+
+    looped(options.loop, lambda: dict(execute(playing, graph, outputs, shown, options.told, began=began).streams))
 
 
 def _recorded_graph(recording: Recording, *, network: bool) -> Graph:
@@ -272,17 +242,23 @@ def _say_what_begins_fresh(recording: Recording, graph: Graph, stamp: int) -> No
             say(f"[yellow]{escape(node.name)} begins with fresh state:[/] {escape(reason)}")
 
 
-def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
+def _complete(recording: Path, graph: Graph, file: Path, options: ReplayOptions) -> None:
     from dataflow.cli.support.progress import RunDisplay, shown
     from dataflow.cli.support.verdicts import print_completion
     from dataflow.verification.complete import complete
 
+    others = (options.start, options.end, options.rate, options.recorded.record, options.viewed, options.placed)
+    if others != (*(None,) * 4, ViewOptions(), PlacementOptions()) or options.paranoid:
+        raise fail(
+            "--complete repeats a run as it was, in one process: of the other options only --graph, "
+            "--set, --overwrite, --quiet and --json go with it"
+        )
     if file.exists() and file.samefile(recording):
         raise fail(f"--complete {file} is the recording that is to be completed; name another file")
-    output_file(file, ".mcap", overwrite=overwrite, option="--complete")
-    with shown(err, RunDisplay(err), quiet=quiet) as watch:
-        made = complete(recording, file, graph=graph, overwrite=overwrite, watch=watch)
-    if json:
+    output_file(file, ".mcap", overwrite=options.overwrite, option="--complete")
+    with shown(err, RunDisplay(err), quiet=options.told.quiet) as watch:
+        made = complete(recording, file, graph=graph, overwrite=options.overwrite, watch=watch)
+    if options.told.json:
         print_json(made.as_json())
     else:
         print_completion(out, made)

@@ -4,46 +4,31 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any
 
 from dataflow.cli.commands.playback import keys
-from dataflow.cli.support.arguments import (
-    GraphFile,
-    ModuleFolders,
-    Settings,
-    existing,
-    find_modules_in,
-    graph_file,
-)
-from dataflow.cli.support.execution import checked_outputs, execute, plan_options
-from dataflow.cli.support.output import fail, friendly_errors
+from dataflow.cli.support.arguments import GraphFile, ModuleFolders, Settings, existing, find_modules_in, graph_file
+from dataflow.cli.support.execution import Outputs, checked_outputs, execute, plan_options
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import fail
 from dataflow.cli.support.run_options import (
-    Compression,
-    Here,
-    Json,
+    PLACEMENT,
+    TIMEOUT,
     Keys,
     Listen,
-    Live,
-    LogLevel,
-    OneProcess,
-    Open,
     Paranoid,
-    Place,
-    ProcessEach,
-    Quiet,
+    PlacementOptions,
     Rate,
-    Record,
     Replace,
+    ReportOptions,
     Step,
     Timeout,
-    Verbose,
-    View,
+    ViewOptions,
     machines_of,
 )
-from dataflow.cli.support.storage import KeepDisk, OnFailure, Readable, SplitEvery, SplitSize, storage_of
+from dataflow.cli.support.storage import RecordOptions
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -51,43 +36,47 @@ if TYPE_CHECKING:
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
-def run(
-    graph: GraphFile,
-    settings: Settings = None,
-    path: ModuleFolders = None,
-    listen: Listen = None,
-    keys_folder: Keys = None,
-    here: Here = False,
-    rate: Rate = None,
-    step: Step = False,
-    timeout: Timeout = 120.0,
-    live: Live = False,
-    paranoid: Paranoid = False,
-    chaos: Annotated[
-        Path | None,
-        typer.Option("--chaos", metavar="PLAN.yaml", help="Let the faults of a plan happen; implies --live."),
-    ] = None,
-    chaos_seed: Annotated[
-        int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
-    ] = None,
-    log_level: LogLevel = None,
-    quiet: Quiet = False,
-    one_process: OneProcess = False,
-    process_each: ProcessEach = False,
-    place: Place = None,
-    record: Record = None,
-    compression: Compression = None,
-    split_every: SplitEvery = None,
-    split_size: SplitSize = None,
-    keep_disk: KeepDisk = None,
-    record_failure: OnFailure = None,
-    readable: Readable = "owner",
-    view: View = None,
-    open_view: Open = False,
-    overwrite: Replace = False,
-    verbose: Verbose = False,
-    json: Json = False,
-) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """The options of `dataflow run`, in the order of its help."""
+
+    settings: Settings = None
+    path: ModuleFolders = None
+    listen: Listen = None
+    keys: Keys = None
+    here: Annotated[bool, option("--here", "Run everything here, without regard to `machine:`.", PLACEMENT)] = False
+    rate: Rate = None
+    step: Step = False
+    timeout: Timeout = TIMEOUT
+    live: Annotated[
+        bool,
+        option(
+            "--live",
+            "Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
+            "`live:` policies say. Everything dropped is counted and recorded.",
+        ),
+    ] = False
+    paranoid: Paranoid = False
+    chaos: Annotated[Path | None, option("--chaos PLAN.yaml", "Let the faults of a plan happen; implies --live.")] = (
+        None
+    )
+    chaos_seed: Annotated[int | None, option("--chaos-seed N", "Another seed than the plan's own.")] = None
+    log_level: Annotated[
+        str | None,
+        option(
+            "--log-level LEVEL",
+            "The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
+            "Environment: DATAFLOW_LOG_LEVEL.",
+        ),
+    ] = None
+    placed: PlacementOptions
+    recorded: RecordOptions
+    viewed: ViewOptions
+    overwrite: Replace = False
+    told: ReportOptions
+
+
+def run(graph: GraphFile, options: RunOptions) -> None:
     """Run a graph.
 
     A table of its operators is shown while it runs, and a summary at the end. Ctrl-C ends it in order: sources stop,
@@ -113,51 +102,49 @@ def run(
     began = time.monotonic()
     from dataflow.supervision.early_nursery import early_nursery
 
-    if chaos_seed is not None and chaos is None:
+    if options.chaos_seed is not None and options.chaos is None:
         raise fail("--chaos-seed varies a fault plan: name it with --chaos")
-    if log_level not in (None, *LOG_LEVELS):
-        raise fail(f"--log-level {log_level}: expected one of {', '.join(LOG_LEVELS)}")
+    if options.log_level not in (None, *LOG_LEVELS):
+        raise fail(f"--log-level {options.log_level}: expected one of {', '.join(LOG_LEVELS)}")
     file = graph_file(graph)
-    find_modules_in(path)
-    with early_nursery() as early, friendly_errors():
+    find_modules_in(options.path)
+    with early_nursery() as early:
         from dataflow.graph import load_graph
         from dataflow.process.log_pipe import LEVEL_VARIABLE
         from dataflow.supervision.run import run as run_graph
 
-        if log_level is not None:
-            os.environ[LEVEL_VARIABLE] = log_level
-        live = live or chaos is not None
-        if live and step:
+        if options.log_level is not None:
+            os.environ[LEVEL_VARIABLE] = options.log_level
+        live = options.live or options.chaos is not None
+        if live and options.step:
             raise fail("--step pauses what reads its sources; a live run cannot wait: devices go on by the clock")
-        loaded = load_graph(file, settings=settings or (), live=live)
-        flight = loaded.record.flight is not None and record is None
-        storage = storage_of(record, split_every, split_size, keep_disk, record_failure, readable, flight=flight)
-        outputs = checked_outputs(record, view, open_view, overwrite, storage)
-        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-        options |= {"live": live, "paused": step, "controls": keys(quiet or json, live=live, flight=flight)}
-        options |= machines_of(loaded, listen, keys_folder, here=here)
-        if compression is not None and record is None and not flight:
-            raise fail("--compression is of a recording: name one with --record")
-        options |= {} if compression is None else {"compression": compression}
-        options |= _flight_folder(loaded) if flight else {}
-        if chaos is not None:
-            from dataflow.chaos.plan import load_plan
-
-            options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
+        loaded = load_graph(file, settings=options.settings or (), live=live)
+        outputs, plan = _planned(loaded, options, live=live)
         execute(
-            lambda watch: run_graph(loaded, watch=watch, early=early, **options),
+            lambda watch: run_graph(loaded, watch=watch, early=early, **plan),
             loaded,
             outputs,
             None,
+            options.told,
             began=began,
-            json=json,
-            quiet=quiet,
-            verbose=verbose,
         )
 
 
-def _flight_folder(graph: Graph) -> dict[str, Path]:
-    assert graph.record.flight is not None
-    folder = Path(graph.record.flight.folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    return {"flight": folder}
+def _planned(graph: Graph, options: RunOptions, *, live: bool) -> tuple[Outputs, dict[str, Any]]:
+    """The checked outputs and the fields of the `RunPlan`."""
+    recorder = graph.record.flight if options.recorded.record is None else None
+    flight, hidden = recorder is not None, options.told.quiet or options.told.json
+    outputs = checked_outputs(options.recorded, options.viewed, overwrite=options.overwrite, flight=flight)
+    plan = plan_options(
+        graph, outputs, options.placed, rate=options.rate, paranoid=options.paranoid, timeout=options.timeout
+    )
+    plan |= {"live": live, "paused": options.step, "controls": keys(hidden, live=live, flight=flight)}
+    plan |= machines_of(graph, options.listen, options.keys, here=options.here)
+    if recorder is not None:
+        plan["flight"] = Path(recorder.folder)
+        plan["flight"].mkdir(parents=True, exist_ok=True)
+    if options.chaos is not None:
+        from dataflow.chaos.plan import load_plan
+
+        plan["faults"] = load_plan(existing(options.chaos, "a fault plan"), graph, seed=options.chaos_seed)
+    return outputs, plan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -11,83 +12,90 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from dataflow.cli.support.arguments import FLAG, Json, Map, ModuleFolders, find_modules_in, graph_file, number
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    count,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    say,
-    seconds,
-    table,
-)
+from dataflow.cli.support.arguments import Json, Map, ModuleFolders, find_modules_in, graph_file, number
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, count, err, fail, out, plural, print_json, say, seconds, table
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
 if TYPE_CHECKING:
-    from dataflow.sweep.plan import What
+    from dataflow.sweep.plan import Choice, What
     from dataflow.sweep.run import Sweep
 
 MOST_NAMED = 5
 """Recordings listed."""
-Graph = Annotated[
-    Path | None,
-    typer.Argument(metavar="[GRAPH]", help="The graph. Default: of each recording the one that made it."),
-]
 Recordings = Annotated[
     list[str] | None,
-    typer.Option(
-        "--recordings", metavar="FILE|FOLDER|URL", help="Recordings, or folders of them, at any depth. May be repeated."
-    ),
+    option("--recordings FILE|FOLDER|URL", "Recordings, or folders of them, at any depth. May be repeated."),
 ]
-Values = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE,VALUE",
-        help="The values of a graph parameter, or OPERATOR.PARAM. May be repeated: every combination is run.",
-    ),
-]
-Done = Annotated[str, typer.Option("--what", metavar="replay|verify|evaluate", help="The work on each recording.")]
-Folder = Annotated[
-    Path, typer.Option("--out", metavar="FOLDER", help="Where the table, the results and the logs are kept.")
-]
-Jobs = Annotated[
-    int | None, typer.Option("--jobs", "-j", metavar="N", help="Recordings at a time. Default: one for each core.")
-]
-Ray = Annotated[
-    str | None,
-    typer.Option(
-        "--ray",
-        metavar="ADDRESS",
-        help="Work on a Ray cluster: its address, auto for the one that runs here, local for one of --jobs cores.",
-    ),
-]
-Patience = Annotated[
-    float,
-    typer.Option(
-        "--timeout", metavar="SECONDS", parser=number(1, 1e7, "seconds"), help="Give a recording up after so long."
-    ),
-]
-Again = Annotated[bool, typer.Option("--again", metavar=FLAG, help="Also run what has a result already.")]
+
+
+@dataclass(frozen=True, slots=True)
+class WorkOptions:
+    """Options of the runs over recordings, and of the folder of their results."""
+
+    maps: Map = None
+    path: ModuleFolders = None
+    folder: Annotated[Path, option("--out FOLDER", "Where the table, the results and the logs are kept.")] = Path(
+        "out/sweep"
+    )
+    jobs: Annotated[int | None, option("--jobs -j N", "Recordings at a time. Default: one for each core.")] = None
+    ray: Annotated[
+        str | None,
+        option(
+            "--ray ADDRESS",
+            "Work on a Ray cluster: its address, auto for the one that runs here, local for one of --jobs cores.",
+        ),
+    ] = None
+    timeout: Annotated[
+        float, option("--timeout SECONDS", "Give a recording up after so long.", parser=number(1, 1e7, "seconds"))
+    ] = 3600.0
+    again: Annotated[bool, option("--again", "Also run what has a result already.")] = False
+
+    def plan(
+        self,
+        recordings: list[str] | None,
+        graph: Path | None,
+        choices: Sequence[Choice],
+        what: What = "replay",
+        name: str = "sweep",
+    ) -> Sweep:
+        """The sweep of these recordings and choices of settings. Raises `SweepError`."""
+        from dataflow.sweep.run import Sweep
+
+        return Sweep(
+            recordings or (),
+            what,
+            None if graph is None else graph_file(graph),
+            choices,
+            self.maps or (),
+            self.path or (),
+            self.folder,
+            self.jobs,
+            self.ray,
+            self.timeout,
+            self.again,
+            name,
+        )
+
+
+AS_USUAL = WorkOptions()
 
 
 def sweep(
-    graph: Graph = None,
+    graph: Annotated[
+        Path | None, argument("[GRAPH]", "The graph. Default: of each recording the one that made it.")
+    ] = None,
     recordings: Recordings = None,
-    settings: Values = None,
-    what: Done = "replay",
-    maps: Map = None,
-    path: ModuleFolders = None,
-    folder: Folder = Path("out/sweep"),
-    jobs: Jobs = None,
-    ray: Ray = None,
-    timeout: Patience = 3600.0,
-    again: Again = False,
+    settings: Annotated[
+        list[str] | None,
+        option(
+            "--set NAME=VALUE,VALUE",
+            "The values of a graph parameter, or OPERATOR.PARAM. May be repeated: every combination is run.",
+        ),
+    ] = None,
+    what: Annotated[str, option("--what replay|verify|evaluate", "The work on each recording.")] = "replay",
+    how: WorkOptions = AS_USUAL,
     quiet: Quiet = False,
     verbose: Verbose = False,
     json: Json = False,
@@ -115,28 +123,16 @@ def sweep(
       dataflow sweep perception --recordings runs --what evaluate --json
       dataflow sweep perception --recordings s3://bucket/runs --ray auto
     """
-    task = _checked(what, maps)
-    with friendly_errors():
-        find_modules_in(path)
-        from dataflow.sweep.plan import SweepError, grid
-        from dataflow.sweep.run import Sweep
-
-        try:
-            file = None if graph is None else graph_file(graph)
-            given = (grid(settings or ()), maps or (), path or ())
-            plan = Sweep(recordings or (), task, file, *given, folder, jobs, ray, timeout, again)
-            spent = work(plan, quiet=quiet)
-        except SweepError as error:
-            raise fail(str(error)) from None
-    _report(plan, spent, json=json, verbose=verbose)
-
-
-def _checked(what: str, maps: Sequence[str] | None) -> What:
     if what not in ("replay", "verify", "evaluate"):
         raise fail(f"--what {what!r}: expected replay, verify or evaluate")
-    if maps and what == "verify":
+    if how.maps and what == "verify":
         raise fail("--map is for bags, and these hold no firing records to verify")
-    return cast("What", what)
+    find_modules_in(how.path)
+    from dataflow.sweep.plan import grid
+
+    plan = how.plan(recordings, graph, grid(settings or ()), cast("What", what))
+    spent = work(plan, quiet=quiet)
+    _report(plan, spent, json=json, verbose=verbose)
 
 
 def work(plan: Sweep, *, quiet: bool) -> float:

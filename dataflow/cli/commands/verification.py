@@ -3,38 +3,19 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.arguments import (
-    FLAG,
-    Json,
-    ModuleFolders,
-    OtherGraph,
-    OtherSettings,
-    check_offset,
-    existing,
-    find_modules_in,
-    graph_file,
-    offset,
-    output_file,
-)
-from dataflow.cli.support.output import (
-    COULD_NOT_RUN,
-    DIFFERENT,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    own_traceback,
-    print_json,
-    say,
-)
+from dataflow.cli.support.again import CodeOptions
+from dataflow.cli.support.arguments import Json, check_offset, existing, offset, output_file
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import COULD_NOT_RUN, DIFFERENT, err, fail, out, own_traceback, print_json, say
 from dataflow.cli.support.run_options import MakeEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:
@@ -44,93 +25,80 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.verification.gate import Baseline, Checked
     from dataflow.verification.report import VerifyReport
+    from dataflow.verification.workers.prestart import EarlyWorkers
 
 _GATE = "Regression gate"
 MOST_JOBS = 1024
 MOST_RUNS = 100_000
 
-_From = Annotated[
-    str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
-]
-_Only = Annotated[
-    list[str] | None,
-    typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
-]
-_Tolerance = Annotated[
-    float | None,
-    typer.Option(
-        "--tolerance",
-        metavar="T",
-        help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
-        "inputs. Reported as within tolerance, never as identical.",
-    ),
-]
-_Start = Annotated[
-    float | None,
-    typer.Option(
-        "--start",
-        metavar="TIME",
-        parser=offset,
-        help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
-        "holds there.",
-    ),
-]
-_Baseline = Annotated[
-    Path | None,
-    typer.Option(
-        "--baseline",
-        metavar="FILE.json",
-        rich_help_panel=_GATE,
-        help="Outcomes that are accepted although they are not what was recorded.",
-    ),
-]
-_Accept = Annotated[
-    bool,
-    typer.Option(
-        "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
-    ),
-]
-_Junit = Annotated[
-    Path | None,
-    typer.Option(
-        "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
-    ),
-]
-_Why = Annotated[
-    bool, typer.Option("--why", metavar=FLAG, help="Find the causes: run each culprit alone, 8 times at most.")
-]
-_Jobs = Annotated[
-    int | None,
-    typer.Option(
-        "--jobs", "-j", metavar="N", help="Worker processes. Default: one for each core, fewer where little is to do."
-    ),
-]
-_Repeat = Annotated[
-    int, typer.Option("--repeat", metavar="N", help="Verify up to N times, until something differs; gives the odds.")
-]
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerifyOptions:
+    """The options of `dataflow verify`, in the order of its help."""
+
+    code: CodeOptions
+    first: Annotated[str | None, option("--from OPERATOR", "Only this operator and what follows from it.")] = None
+    only: Annotated[list[str] | None, option("--only OPERATOR", "Only this operator; may be given several times.")] = (
+        None
+    )
+    tolerance: Annotated[
+        float | None,
+        option(
+            "--tolerance T",
+            "Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
+            "inputs. Reported as within tolerance, never as identical.",
+        ),
+    ] = None
+    start: Annotated[
+        float | None,
+        option(
+            "--start TIME",
+            "Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
+            "holds there.",
+            parser=offset,
+        ),
+    ] = None
+    baseline: Annotated[
+        Path | None,
+        option("--baseline FILE.json", "Outcomes that are accepted although they are not what was recorded.", _GATE),
+    ] = None
+    accept: Annotated[bool, option("--accept", "Write what differs now into the --baseline file.", _GATE)] = False
+    junit: Annotated[Path | None, option("--junit FILE.xml", "Write the results as JUnit XML (replaced).", _GATE)] = (
+        None
+    )
+    jobs: Annotated[
+        int | None, option("--jobs -j N", "Worker processes. Default: one for each core, fewer where little is to do.")
+    ] = None
+    repeat: Annotated[int, option("--repeat N", "Verify up to N times, until something differs; gives the odds.")] = 1
+    make_effects: MakeEffects = False
+    paranoid: Paranoid = False
+    why: Annotated[bool, option("--why", "Find the causes: run each culprit alone, 8 times at most.")] = False
+    quiet: Quiet = False
+    json: Json = False
+
+    def check(self) -> None:
+        """Ends the command where options exclude each other, or lie outside their bounds."""
+        if self.jobs is not None and not 1 <= self.jobs <= MOST_JOBS:
+            raise fail(f"--jobs {self.jobs}: expected 1 to {MOST_JOBS}")
+        if not 1 <= self.repeat <= MOST_RUNS:
+            raise fail(f"--repeat {self.repeat}: expected 1 to {MOST_RUNS}")
+        if self.first is not None and self.only:
+            raise fail("--from and --only exclude each other")
+        self.code.check()
+        if self.tolerance is not None and not 0 <= self.tolerance < float("inf"):
+            raise fail(f"--tolerance {self.tolerance:g}: expected a finite number, 0 or more")
+        check_offset("--start", self.start)
+        if self.start is not None and self.baseline is not None:
+            raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
+        if self.accept and self.baseline is None:
+            raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
+        if self.accept and (self.first is not None or self.only):
+            raise fail("--accept takes whole recordings: leave --from and --only out")
 
 
 def verify(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
-    ],
-    graph: OtherGraph = None,
-    settings: OtherSettings = None,
-    path: ModuleFolders = None,
-    first: _From = None,
-    only: _Only = None,
-    tolerance: _Tolerance = None,
-    start: _Start = None,
-    baseline: _Baseline = None,
-    accept: _Accept = False,
-    junit: _Junit = None,
-    jobs: _Jobs = None,
-    repeat: _Repeat = 1,
-    make_effects: MakeEffects = False,
-    paranoid: Paranoid = False,
-    why: _Why = False,
-    quiet: Quiet = False,
-    json: Json = False,
+    recordings: Annotated[list[Path], argument("RECORDING", "Recordings (.mcap), or folders of them.")],
+    options: VerifyOptions,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
 
@@ -162,66 +130,21 @@ def verify(
     """
     from dataflow.verification.workers.prestart import early_workers
 
-    with friendly_errors():
-        only = only or None  # typer gives an empty list where there is none
-        if jobs is not None and not 1 <= jobs <= MOST_JOBS:
-            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}")
-        if not 1 <= repeat <= MOST_RUNS:
-            raise fail(f"--repeat {repeat}: expected 1 to {MOST_RUNS}")
-        _refuse_what_excludes(first, only, graph, settings, tolerance, start, baseline, accept=accept)
-        _check_files(recordings, junit, baseline)
-        with early_workers(jobs) as early:  # while this process imports what it needs itself
-            from dataflow.graph import load_graph
-            from dataflow.verification.gate import recordings_in
+    options.check()
+    _check_files(recordings, options.junit, options.baseline)
+    with early_workers(options.jobs) as early:  # while this process imports what it needs itself
+        from dataflow.verification import gate
 
-            known = None if baseline is None else _loaded(baseline)
-            find_modules_in(path)
-            loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-            options: dict[str, Any] = {
-                "early": early,
-                "graph": loaded,
-                "first": first,
-                "only": only,
-                "tolerance": tolerance,
-                "start": start,
-                "jobs": jobs,
-                "paranoid": paranoid,
-                "make_effects": make_effects,
-            }
-            found = recordings_in(recordings)
-            single = len(recordings) == 1 and recordings[0] == found[0][0]
-            checked = _check(found, known, options, repeat, quiet=quiet, single=single)
-            reasons = [_reasons(one, only, loaded, quiet=quiet) for one in checked] if why else []
-            _report(checked, reasons, _options(graph, settings, path), single=single, json=json, junit=junit)
-            if known is not None:
-                _mind_baseline(known, checked, accept=accept, whole=not single)
-    raise typer.Exit(_exit_code(checked, known if accept else None))
-
-
-def _refuse_what_excludes(
-    first: str | None,
-    only: list[str] | None,
-    graph: Path | None,
-    settings: list[str] | None,
-    tolerance: float | None,
-    start: float | None,
-    baseline: Path | None,
-    *,
-    accept: bool,
-) -> None:
-    if first is not None and only is not None:
-        raise fail("--from and --only exclude each other")
-    if graph is None and settings:
-        raise fail("--set changes a graph file: name it with --graph")
-    if tolerance is not None and not 0 <= tolerance < float("inf"):
-        raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
-    check_offset("--start", start)
-    if start is not None and baseline is not None:
-        raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
-    if accept and baseline is None:
-        raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
-    if accept and (first is not None or only is not None):
-        raise fail("--accept takes whole recordings: leave --from and --only out")
+        known = None if options.baseline is None else gate.Baseline.load(options.baseline)
+        graph = options.code.load()
+        found = gate.recordings_in(recordings)
+        single = len(recordings) == 1 and recordings[0] == found[0][0]
+        checked = _check(found, known, graph, early, options, single=single)
+        reasons = [_reasons(c, options.only, graph, quiet=options.quiet) for c in checked] if options.why else []
+        _report(checked, reasons, options, single=single)
+        if known is not None:
+            _mind_baseline(known, checked, accept=options.accept, whole=not single)
+    raise typer.Exit(_exit_code(checked, known if options.accept else None))
 
 
 def _check_files(recordings: list[Path], junit: Path | None, baseline: Path | None) -> None:
@@ -234,32 +157,23 @@ def _check_files(recordings: list[Path], junit: Path | None, baseline: Path | No
         output_file(baseline, ".json", overwrite=True, option="--baseline")
 
 
-def _loaded(file: Path) -> Baseline:
-    from dataflow.verification.gate import Baseline, BaselineError
-
-    try:
-        return Baseline.load(file)
-    except BaselineError as error:
-        raise fail(str(error)) from None
-
-
 def _check(
     targets: list[tuple[Path, str]],
     known: Baseline | None,
-    options: dict[str, Any],
-    repeat: int,
+    graph: Graph | None,
+    early: EarlyWorkers,
+    options: VerifyOptions,
     *,
-    quiet: bool,
     single: bool,
 ) -> list[Checked]:
     from dataflow.verification.gate import check
 
     checked = []
     for number, (path, name) in enumerate(targets, start=1):
-        if not quiet and not single:
+        if not options.quiet and not single:
             say(f"[dim]{number} of {len(targets)}: {escape(name)}[/]")
         accepted = {} if known is None else known.of(path)
-        one = check(path, name, _verifier(options, quiet=quiet), accepted, options["graph"], repeat)
+        one = check(path, name, _verifier(graph, early, options), accepted, graph, options.repeat)
         if one.not_in_graph:
             names = escape(", ".join(one.not_in_graph))
             say(f"[yellow]note:[/] {escape(name)}: recorded operators that the graph does not have: {names}")
@@ -267,16 +181,28 @@ def _check(
     return checked
 
 
-def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], VerifyReport]:
+def _verifier(graph: Graph | None, early: EarlyWorkers, options: VerifyOptions) -> Callable[[Path], VerifyReport]:
     from dataflow.verification.verify import verify as verify_recording
 
-    if quiet:  # nothing is shown: what would show it is not imported
-        return partial(verify_recording, **options)
+    verify_one = partial(
+        verify_recording,
+        early=early,
+        graph=graph,
+        first=options.first,
+        only=options.only or None,
+        tolerance=options.tolerance,
+        start=options.start,
+        jobs=options.jobs,
+        paranoid=options.paranoid,
+        make_effects=options.make_effects,
+    )
+    if options.quiet:  # nothing is shown: what would show it is not imported
+        return verify_one
     from dataflow.cli.support.progress import RunDisplay, shown
 
     def verifier(path: Path) -> VerifyReport:
-        with shown(err, RunDisplay(err), quiet=quiet) as watch:
-            return verify_recording(path, watch=watch, **options)
+        with shown(err, RunDisplay(err), quiet=False) as watch:
+            return verify_one(path, watch=watch)
 
     return verifier
 
@@ -301,52 +227,38 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None, *, q
         return reasons(checked.path, checked.report, only or (), graph, progress)
 
 
-def _options(graph: Path | None, settings: list[str] | None, path: list[Path] | None) -> list[str]:
-    """The words by which another command is given the same graph and modules."""
-    named = (("--graph", [] if graph is None else [graph]), ("--set", settings or ()), ("--path", path or ()))
-    return [word for option, values in named for value in values for word in (option, shlex.quote(str(value)))]
-
-
-def _report(
-    checked: list[Checked],
-    reasons: list[list[Why]],
-    options: list[str],
-    *,
-    single: bool,
-    json: bool,
-    junit: Path | None,
-) -> None:
+def _report(checked: list[Checked], reasons: list[list[Why]], options: VerifyOptions, *, single: bool) -> None:
     from dataflow.cli.support.causes import print_reasons
-    from dataflow.cli.support.verdicts import explain, print_many, print_one, reservations
+    from dataflow.cli.support.verdicts import print_many, print_one
 
     found = [{"why": [one.as_json() for one in each]} for each in reasons] or [{}] * len(checked)
 
     if single and checked[0].report is None:
         [one] = checked
         fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
-    elif single and json:
+    elif single and options.json:
         print_json(checked[0].as_json() | found[0])
     elif single:
         print_one(out, checked[0])
         for name in checked[0].culprits[:1]:
-            path = shlex.quote(str(checked[0].path))
+            path, code = str(checked[0].path), options.code.words
             if checked[0].report is not None and _may_be_a_test(checked[0].report, name, reasons):
-                words = ["dataflow capture", path, "--op", name, *options]
-                out.print(Text(f"as a test: {' '.join(words)}", style="dim"), soft_wrap=True)
-            words = ["dataflow debug", path, name, *options, "--do diff"]
-            out.print(Text(f"next: {' '.join(words)}", style="dim"), soft_wrap=True)
-    elif json:
+                words = ["dataflow", "capture", path, "--op", name, *code]
+                out.print(Text(f"as a test: {shlex.join(words)}", style="dim"), soft_wrap=True)
+            words = ["dataflow", "debug", path, name, *code, "--do", "diff"]
+            out.print(Text(f"next: {shlex.join(words)}", style="dim"), soft_wrap=True)
+    elif options.json:
         values = [c.as_json() | more for c, more in zip(checked, found, strict=True)]
         print_json({"passed": all(c.passed for c in checked), "recordings": values})
     else:
         print_many(out, checked)
-    if not json:
+    if not options.json:
         for one, each in zip(checked, reasons, strict=False):
             print_reasons(out, "" if single else one.name, each)
-    if junit is not None:
+    if options.junit is not None:
         from dataflow.cli.support.junit import write_junit
 
-        write_junit(junit, checked, explain, reservations)
+        write_junit(options.junit, checked)
 
 
 def _may_be_a_test(report: VerifyReport, operator: str, reasons: list[list[Why]]) -> bool:

@@ -6,33 +6,33 @@ import importlib
 import time
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph, say_followed
+from dataflow.cli.commands.following.live import THE_ONLY, Running, say_followed
 from dataflow.cli.support.arguments import (
-    Clock,
-    End,
+    ALL,
     Every,
     Overwrite,
-    Start,
-    Streams,
-    Without,
+    Selection,
     chosen_streams,
     existing_recording,
     output_file,
 )
 from dataflow.cli.support.drawing import Announcer, Drawn, draw_recording, open_sink, report, showing, until_interrupted
-from dataflow.cli.support.output import fail, friendly_errors, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import fail, say
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.messages import Message
     from dataflow.transport import RunningGraph, TapClient
-    from dataflow.view import Target
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Target, ViewerSink
 
 LOOK_EVERY = 0.25
 """Seconds between two looks at the log of the graph that is followed."""
@@ -41,34 +41,24 @@ LOOK_EVERY = 0.25
 def view(
     recording: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="RECORDING",
-            help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder. Without one: the running graph.",
+        argument(
+            "RECORDING", "A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder. Without one: the running graph."
         ),
     ] = None,
     to: Annotated[
         str,
-        typer.Option(
-            "--to",
-            "--out",
-            "-o",
-            metavar="TARGET",
-            help="spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
+        option(
+            "--to --out -o TARGET",
+            "spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
             "runs (rerun+http://127.0.0.1:9876/proxy).",
         ),
     ] = "spawn",
-    streams: Streams = None,
-    without: Without = None,
-    start: Start = None,
-    end: End = None,
-    clock: Clock = "auto",
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    asked: Selection = ALL,
+    which: Running = THE_ONLY,
     every: Every = None,
     overwrite: Overwrite = False,
     modules: Annotated[
-        list[str] | None,
-        typer.Option("--import", metavar="MODULE", help="Import a module with visualisers first. May be repeated."),
+        list[str] | None, option("--import MODULE", "Import a module with visualisers first. May be repeated.")
     ] = None,
     until_end: Annotated[bool, typer.Option("--until-end", hidden=True)] = False,
 ) -> None:
@@ -85,18 +75,16 @@ def view(
       dataflow view drive.bag --to drive.rrd
       dataflow view --graph rgbd_perception --to serve
     """
-    with friendly_errors():
-        _import(modules or ())
-        if recording is not None:
-            if graph is not None or wait:
-                raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
-            path = existing_recording(recording)
-            target = _target(to, overwrite)
-            report(draw_recording(path, target, streams, without, start, end, clock, every))
-        else:
-            if start is not None or end is not None or without or clock != "auto":
-                raise fail("--start, --end, --without and --clock are about a recording; name one")
-            _view_running(_target(to, overwrite), streams, graph, wait, every, until_end=until_end)
+    _import(modules or ())
+    if recording is not None:
+        if which != THE_ONLY:
+            raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
+        path = existing_recording(recording)
+        report(draw_recording(path, _target(to, overwrite), asked, every))
+    else:
+        if replace(asked, streams=None, without=asked.without or None) != ALL:
+            raise fail("--start, --end, --without and --clock are about a recording; name one")
+        _view_running(_target(to, overwrite), asked.streams, which, every, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:
@@ -129,73 +117,58 @@ def require_display() -> None:
 
 
 def _view_running(
-    target: Target, streams: list[str] | None, name: str | None, wait: float, every: float | None, *, until_end: bool
+    target: Target, streams: list[str] | None, which: Running, every: float | None, *, until_end: bool
 ) -> None:
+    """Draws streams of a graph until it ends; all of them with what it logs, if none are named."""
     from dataflow.client.attach import graph_of, tap
     from dataflow.graph.sections import PLACE_FRAMES
+    from dataflow.interop.account import Account
+    from dataflow.names import logs_key
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Serve
 
-    if wait:
+    if which.wait:
         importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
-    found = running_graph(name, wait)
+    found = which.found()
     running = graph_of(found)
-    chosen = chosen_streams(streams, running.streams, running.namespace)
+    chosen, logs = chosen_streams(streams, running.streams, running.namespace), not streams
     others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]
-    others = [name for name in others if name not in chosen]
+    others = [name for name in others if name not in chosen]  # not shown, but place frames
     with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
         say_followed(found)
-        _draw_running(target, client, found, running, chosen, others, every, logs=not streams, until_end=until_end)
+        with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
+            types = _types(running, [*chosen, *others], logs_key(running.namespace) if logs else None)
+            sink.open(types, showing(running, None if logs else chosen), hidden=others)
+            Announcer(sink).announce()
+            _draw_running(sink, client, found, follower if logs else None, logs_key(running.namespace))
+            client.close()
+            if isinstance(target, Serve) and not until_end:
+                say("the graph has ended; still serving until Ctrl-C")
+                until_interrupted()
+            complete = sink.close(timeout=60.0)
+    report(Drawn(sink, complete, Account()))
 
 
 def _draw_running(
-    target: Target,
-    client: TapClient,
-    found: RunningGraph,
-    running: Graph,
-    chosen: list[str],
-    others: list[str],
-    every: float | None,
-    *,
-    logs: bool,
-    until_end: bool,
+    sink: ViewerSink, client: TapClient, found: RunningGraph, follower: LogFollower | None, log_stream: str
 ) -> None:
-    """Draws the streams that were chosen until the graph ends, and what it logs with them.
-
-    `others` are not shown, but place frames.
-    """
+    """Draws what comes, and the log if it is followed, until the graph ends."""
     from dataflow.client.attach import still_runs
-    from dataflow.names import logs_key
     from dataflow.recording import LogLine
-    from dataflow.transport.log_file import LogFollower
-    from dataflow.view import Serve, as_alarm
+    from dataflow.view import as_alarm
 
-    log_stream = logs_key(running.namespace)
-    with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
-        types = _types(running, [*chosen, *others], log_stream if logs else None)
-        sink.open(types, showing(running, None if logs else chosen), hidden=others)
-        Announcer(sink).announce()
-        clock, look_due = 0, 0.0
-        while True:
-            taken = client.take(timeout=0.5)
-            if logs and time.monotonic() >= look_due:
-                look_due = time.monotonic() + LOOK_EVERY
-                for value in follower.lines():
-                    sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
-            if taken is None:
-                if not still_runs(found):
-                    break
-                continue
-            envelope = taken.decode()
-            if envelope.message is not None:
-                clock = max(clock, envelope.message.stamp)
-                sink.log(taken.stream, envelope.message)
-        client.close()
-        if isinstance(target, Serve) and not until_end:
-            say("the graph has ended; still serving until Ctrl-C")
-            until_interrupted()
-        complete = sink.close(timeout=60.0)
-    from dataflow.interop.account import Account
-
-    report(Drawn(sink, complete, Account()))
+    clock, look_due = 0, 0.0
+    while True:
+        taken = client.take(timeout=0.5)
+        if follower is not None and time.monotonic() >= look_due:
+            look_due = time.monotonic() + LOOK_EVERY
+            for value in follower.lines():
+                sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
+        if taken is not None and (message := taken.decode().message) is not None:
+            clock = max(clock, message.stamp)
+            sink.log(taken.stream, message)
+        elif taken is None and not still_runs(found):
+            return
 
 
 def _types(running: Graph, chosen: list[str], logs: str | None) -> dict[str, type[Message]]:

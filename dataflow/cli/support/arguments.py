@@ -4,82 +4,59 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from dataflow.cli.commands.completion import shipped_graphs
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, seconds
 
 if TYPE_CHECKING:
     from dataflow.execution.feeds.playable import PlayableStreams
 
-FLAG = " "
-"""The metavar of an option without a value: nothing is shown."""
-
-Json = Annotated[bool, typer.Option("--json", metavar=FLAG, help="Print JSON instead of tables.")]
+Json = Annotated[bool, option("--json", "Print JSON instead of tables.")]
 Network = Annotated[
     bool,
-    typer.Option(
+    option(
         "--network",
-        metavar=FLAG,
-        help="Obey the `network:` section of the graph inside the recording: open its ports, connect to its endpoints.",
+        "Obey the `network:` section of the graph inside the recording: open its ports, connect to its endpoints.",
     ),
 ]
 Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
+    list[str] | None, option("--set NAME=VALUE", "Set a graph parameter, or OPERATOR.PARAM. May be repeated.")
 ]
 OtherSettings = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Set a graph parameter, or OPERATOR.PARAM, of the graph that --graph names. May be repeated.",
+    option(
+        "--set NAME=VALUE",
+        "Set a graph parameter, or OPERATOR.PARAM, of the graph that --graph names. May be repeated.",
     ),
 ]
 GraphFile = Annotated[
     Path,
-    typer.Argument(
-        metavar="GRAPH",
-        autocompletion=shipped_graphs,
-        help="A graph file (.yaml), or a name that `dataflow graphs` lists.",
-    ),
+    argument("GRAPH", "A graph file (.yaml), or a name that `dataflow graphs` lists.", autocompletion=shipped_graphs),
 ]
-OtherGraph = Annotated[
-    Path | None,
-    typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
-]
-AnyRecording = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")
-]
-Map = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--map",
-        metavar="TOPIC=STREAM",
-        help="Of a bag: the topic that stands in for a stream of the graph's sources. May be repeated.",
-    ),
-]
+OtherGraph = Annotated[Path | None, option("--graph GRAPH", "Another graph than the one that made the recording.")]
+AnyRecording = Annotated[Path, argument("RECORDING", "A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")]
 Clock = Annotated[
     Literal["auto", "header", "log"],
-    typer.Option(
-        "--clock",
-        metavar="auto|header|log",
-        help="Of a bag: stamp messages with the time in their headers, or with the time of their recording.",
+    option(
+        "--clock auto|header|log",
+        "Of a bag: stamp messages with the time in their headers, or with the time of their recording.",
     ),
 ]
-Strict = Annotated[
-    bool,
-    typer.Option(
-        "--strict", metavar=FLAG, help="Of a bag: fail at a message that cannot be read, instead of counting it."
+Strict = Annotated[bool, option("--strict", "Of a bag: fail at a message that cannot be read, instead of counting it.")]
+Map = Annotated[
+    list[str] | None,
+    option(
+        "--map TOPIC=STREAM", "Of a bag: the topic that stands in for a stream of the graph's sources. May be repeated."
     ),
 ]
-OutInstead = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="PATH", help="Instead of the argument: what to write.")
-]
-RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
+OutInstead = Annotated[Path | None, option("--out -o PATH", "Instead of the argument: what to write.")]
+RecordingFile = Annotated[Path, argument("RECORDING", "A recording (.mcap).")]
 
 
 def offset(word: str) -> float:
@@ -97,48 +74,59 @@ def offset(word: str) -> float:
 
 Start = Annotated[
     float | None,
-    typer.Option(
-        "--start",
-        metavar="TIME",
-        parser=offset,
-        help="Begin so long after the recording's first message: seconds, or 500ms, 2min.",
+    option(
+        "--start TIME", "Begin so long after the recording's first message: seconds, or 500ms, 2min.", parser=offset
     ),
 ]
 End = Annotated[
     float | None,
-    typer.Option(
-        "--end",
-        metavar="TIME",
-        parser=offset,
-        help="End so long after the recording's first message: seconds, or 500ms, 2min.",
-    ),
+    option("--end TIME", "End so long after the recording's first message: seconds, or 500ms, 2min.", parser=offset),
 ]
 Every = Annotated[
     float | None,
-    typer.Option(
-        "--every",
-        metavar="TIME",
-        parser=offset,
-        help="Of a viewer file: draw one image, overlay and cloud of each stream in so much event time; 0: every one. "
+    option(
+        "--every TIME",
+        "Of a viewer file: draw one image, overlay and cloud of each stream in so much event time; 0: every one. "
         "Default: that of the graph (`view: every`), else 200ms.",
+        parser=offset,
     ),
 ]
-Streams = Annotated[
-    list[str] | None,
-    typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
-]
-Without = Annotated[
-    list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")
-]
+Streams = Annotated[list[str] | None, option("--stream STREAM", "Only these streams; wildcards work. May be repeated.")]
+Without = Annotated[list[str] | None, option("--without STREAM", "Leave these streams out. May be repeated.")]
+
+
+@dataclass(frozen=True, slots=True)
+class BagOptions:
+    """Options of a bag: its topics, clock and faults."""
+
+    maps: Map = None
+    clock: Clock = "auto"
+    strict: Strict = False
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Selection of messages: streams, a span, and the clock of a bag."""
+
+    streams: Streams = None
+    without: Without = None
+    start: Start = None
+    end: End = None
+    clock: Clock = "auto"
+
+    def of(self, names: Iterable[str], namespace: str) -> list[str]:
+        """The streams that are asked for."""
+        return chosen_streams(self.streams, names, namespace, self.without)
+
+
+ALL = Selection()
+
+
 ModuleFolders = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--path",
-        metavar="DIR",
-        help="Look for the operators' modules in DIR too, before the current folder. May be repeated.",
-    ),
+    option("--path DIR", "Look for the operators' modules in DIR too, before the current folder. May be repeated."),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace output files that exist.")]
+Overwrite = Annotated[bool, option("--overwrite", "Replace output files that exist.")]
 
 
 def number(low: float, high: float, meaning: str) -> Callable[[str], float]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
-from rich.progress import Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
 from dataflow.cli.support.arguments import span, window
@@ -17,7 +15,8 @@ from dataflow.cli.support.execution import Outputs, execute
 from dataflow.cli.support.output import (
     DIFFERENT,
     count,
-    err,
+    counting,
+    facts_table,
     fail,
     out,
     plural,
@@ -30,30 +29,25 @@ from dataflow.cli.support.output import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from dataflow.cli.support.arguments import BagOptions
+    from dataflow.cli.support.run_options import ReportOptions
     from dataflow.graph import Graph
     from dataflow.interop.playing import Matching
     from dataflow.interop.streams import BagStreams
-    from dataflow.recording.mcap.index import McapFile
     from dataflow.supervision.core.report import RunReport, Watch
 
 
 def replay_bag(
     path: Path,
     graph: Graph,
-    maps: Sequence[str],
-    clock: Literal["auto", "header", "log"],
+    bag: BagOptions,
     start: float | None,
     end: float | None,
     outputs: Outputs,
     options: dict[str, Any],
+    told: ReportOptions,
     *,
-    strict: bool = False,
     began: float,
-    json: bool,
-    quiet: bool,
-    verbose: bool,
 ) -> None:
     """Replays a bag through a graph; prints which topics are played, by which clock, and what was repaired."""
     from dataflow.editing.untouched import keep_untouched
@@ -64,9 +58,12 @@ def replay_bag(
     from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay
 
-    matching = match(path, graph, maps)
-    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch, strict=strict) as opened:
-        if not quiet:
+    matching = match(path, graph, bag.maps or ())
+    with (
+        counting("reading times", hidden=told.quiet) as watch,
+        BagStreams(path, matching.played(), bag.clock, watch=watch, strict=bag.strict) as opened,
+    ):
+        if not told.quiet:
             say_what_is_played(matching, opened)
         whole = span(opened, plan_replay(opened, graph).streams)
         begin, finish = window(whole, start, end, path)
@@ -79,20 +76,11 @@ def replay_bag(
             notice(path, opened.account.short)
             return report
 
-        execute(
-            playing,
-            graph,
-            outputs,
-            shown,
-            began=began,
-            json=json,
-            quiet=quiet,
-            verbose=verbose,
-        )
+        execute(playing, graph, outputs, shown, told, began=began)
         if outputs.record is not None:
             played = {p.topic for p in opened.played.values()}
             kept = keep_untouched(outputs.record, path, played, begin, finish, shift=opened.clock.shift)
-            if kept and not quiet:
+            if kept and not told.quiet:
                 names = ", ".join(sorted(kept))
                 say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
         if opened.account.short:
@@ -129,21 +117,11 @@ def say_what_is_played(matching: Matching, opened: BagStreams) -> None:
     say(f"[dim]stamped with {what}: {escape(opened.clock.why)}[/]")
 
 
-@contextmanager
-def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
-    """Shows how many messages the first pass over a bag has seen."""
-    if quiet or not err.is_terminal:
-        yield None
-        return
-    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
-        task = progress.add_task("reading times")
-        yield lambda seen: progress.update(task, description=f"reading times · {count(seen)} messages")
-
-
 def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
     """Prints the topics of a bag: types, counts, rates, and what each can be played as; of MCAP files what they hold
     besides, with `metadata` all of it."""
     from dataflow.interop.bag import shortfalls
+    from dataflow.interop.mcap_bag import McapBag
     from dataflow.interop.opening import open_bag
     from dataflow.interop.playing import readings_of
     from dataflow.interop.summary import summaries, total
@@ -153,7 +131,7 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
     try:
         rows = summaries(bag, readings_of(bag))
         kind, notes = bag.kind, (*bag.notes, *shortfalls(bag))
-        files: Sequence[McapFile] = getattr(bag, "files", ())
+        files = bag.files if isinstance(bag, McapBag) else []
         records = [(name, values) for file in files for name, values in file.metadata]
         attached = sum(file.attached for file in files)
     finally:
@@ -167,9 +145,7 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
         facts |= {"attachments": attached, "metadata": [{"name": name, "values": values} for name, values in records]}
         print_json(facts | {"topics": [row.as_json() for row in rows]} | whole.as_json())
         return
-    grid = table("", "")
-    grid.box, grid.show_header = None, False
-    for name, value in (
+    about = (
         ("file", str(path)),
         ("format", kind),
         ("size", size(_bytes(path))),
@@ -179,9 +155,8 @@ def describe_bag(path: Path, *, metadata: bool, json: bool) -> None:
         ("messages", count(whole.messages)),
         *((("attachments", count(attached)),) if attached else ()),
         *((("metadata", f"{', '.join(name for name, _ in records)} (--metadata prints it)"),) if records else ()),
-    ):
-        grid.add_row(Text(name, style="dim"), Text(value))
-    out.print(grid)
+    )
+    out.print(facts_table((name, value, "") for name, value in about))
     numbers = ("messages", "Hz")
     made = table("topic", "type", *numbers, "read as", "", right=numbers)
     for row in rows:

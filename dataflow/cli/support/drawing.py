@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.arguments import chosen_streams, refuse_of_recording, span, window
+from dataflow.cli.support.arguments import Selection, refuse_of_recording, span, window
 from dataflow.cli.support.output import DIFFERENT, err, fail, out, plural, say, size
 
 if TYPE_CHECKING:
@@ -35,16 +35,7 @@ class Drawn:
 
 
 def draw_recording(
-    path: Path,
-    target: Target,
-    streams: list[str] | None,
-    without: list[str] | None,
-    start: float | None,
-    end: float | None,
-    clock: Choice,
-    every: float | None = None,
-    *,
-    strict: bool = False,
+    path: Path, target: Target, asked: Selection, every: float | None = None, *, strict: bool = False
 ) -> Drawn:
     """Draws a recording or a bag. `strict`: what cannot be read of a bag is an error, else it is counted."""
     from rich.progress import BarColumn, Progress, TextColumn
@@ -52,22 +43,22 @@ def draw_recording(
     from dataflow.recording.layout import RECORDING
     from dataflow.view import Serve, from_recording
 
-    with opened_streams(path, clock, strict=strict) as opened:
+    with opened_streams(path, asked.clock, strict=strict) as opened:
         known = account_of(opened).lines()
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         if not readable:
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
         namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(streams, readable, namespace, without)
+        chosen = asked.of(readable, namespace)
         if not any(opened.streams[name].count for name in chosen):
             raise fail(f"{path} holds no message of {', '.join(chosen)}")
         graph = _graph_of(opened)
         if graph is not None:
-            graph = showing(graph, streams and chosen)
+            graph = showing(graph, asked.streams and chosen)
         if generic := sorted({_type_name(opened, name) for name in chosen if opened.streams[name].generic}):
             say(f"[dim]drawn by the recording's own declaration, without its module: {', '.join(generic)}[/]")
         whole = span(opened, chosen)
-        begin, finish = window(whole, start, end, path)
+        begin, finish = window(whole, asked.start, asked.end, path)
         first, last = whole or (0, 0)
         first, last = begin or first, last if finish is None else min(finish, last)
         with open_sink(target, every) as sink:

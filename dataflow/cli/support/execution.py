@@ -15,9 +15,12 @@ from rich.markup import escape
 
 from dataflow.cli.support.arguments import output_file
 from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, about_a_file, err, fail, out, print_json, say, size
+from dataflow.cli.support.run_options import TIMEOUT, PlacementOptions
 from dataflow.cli.support.storage import named, recording_file
 
 if TYPE_CHECKING:
+    from dataflow.cli.support.run_options import ReportOptions, ViewOptions
+    from dataflow.cli.support.storage import RecordOptions
     from dataflow.graph import Graph
     from dataflow.recording.parts import Storage
     from dataflow.supervision.core.report import RunFailed, RunReport, Watch
@@ -33,50 +36,51 @@ class Outputs:
     open_file: bool
     overwrite: bool
     storage: Storage | None = None
+    compression: str | None = None
 
 
-def checked_outputs(
-    record: Path | None, view: str | None, open_view: bool, overwrite: bool, storage: Storage | None = None
-) -> Outputs:
+def checked_outputs(recorded: RecordOptions, viewed: ViewOptions, *, overwrite: bool, flight: bool = False) -> Outputs:
     """Checks the options that name outputs; ends the command where they contradict each other or a file is there."""
+    storage, record, view = recorded.storage(flight=flight), recorded.record, viewed.view
     saves = view is not None and view.endswith(".rrd")
     if view is not None and view not in ("spawn", "serve") and not saves:
         raise fail(f"--view {view!r}: expected spawn, serve, or a file name that ends in .rrd")
     if view is not None:
         import_module("rerun")  # before a run begins whose viewer could not
-    if open_view and not saves:
+    if viewed.open_saved and not saves:
         raise fail("--open opens a saved file: it needs --view FILE.rrd")
     if view == "spawn":
         from dataflow.cli.commands.viewing import require_display
 
         require_display()
     if record is not None:
-        splitting = None if storage is None else storage.splitting
-        record = recording_file(named(record), splitting, overwrite=overwrite, option="--record")
+        record = recording_file(named(record), storage.splitting, overwrite=overwrite, option="--record")
     view_file = Path(view) if view is not None and saves else None
     if view_file is not None:
         output_file(view_file, ".rrd", overwrite=overwrite, option="--view")
-    return Outputs(record, view_file, None if saves else view, open_view, overwrite, storage)
+    live_view = None if saves else view
+    return Outputs(record, view_file, live_view, viewed.open_saved, overwrite, storage, recorded.compression)
 
 
 def plan_options(
     graph: Graph,
     outputs: Outputs,
-    one_process: bool,
-    process_each: bool,
-    place: list[str] | None,
-    rate: float | None,
-    paranoid: bool,
-    timeout: float,
+    placement: PlacementOptions | None = None,
+    *,
+    rate: float | None = None,
+    paranoid: bool = False,
+    timeout: float = TIMEOUT,
 ) -> dict[str, Any]:
     """Returns the fields of a `RunPlan` that the options give."""
-    stored = {}
+    stored: dict[str, Any] = {}
     if outputs.storage is not None:
         on_failure = outputs.storage.on_failure or graph.record.on_failure
         stored["storage"] = replace(outputs.storage, on_failure=on_failure)
+    if outputs.compression is not None:
+        stored["compression"] = outputs.compression
     return {
         **stored,
-        "placement": _placement(graph, one_process, process_each, place),
+        "placement": (placement or PlacementOptions()).placement(graph),
         "record": outputs.record,
         "overwrite": outputs.overwrite,
         "view_file": outputs.view_file,
@@ -87,31 +91,14 @@ def plan_options(
     }
 
 
-def _placement(graph: Graph, one_process: bool, process_each: bool, place: list[str] | None) -> Any:
-    if one_process + process_each + bool(place) > 1:
-        raise fail("--one-process, --process-each and --place exclude each other")
-    if not place:
-        return "one_process" if one_process else "process_each" if process_each else "graph"
-    placement = {}
-    for word in place:
-        operator, separator, process = word.partition("=")
-        if not separator or not process or operator not in graph.nodes:
-            known = ", ".join(graph.nodes)
-            raise fail(f"--place {word!r}: expected OPERATOR=PROCESS with an operator of the graph ({known})")
-        placement[operator] = process
-    return placement
-
-
 def execute(
     start: Callable[[Watch | None], RunReport],
     graph: Graph,
     outputs: Outputs,
     shown_span: tuple[int, int] | None,
+    told: ReportOptions,
     *,
     began: float,
-    json: bool,
-    quiet: bool,
-    verbose: bool = False,
 ) -> RunReport:
     """Runs it; ends the command where it was interrupted, or where its recording lacks something."""
     from dataflow.cli.support.progress import RunDisplay, shown
@@ -122,7 +109,7 @@ def execute(
     before = {file: _written(file) for file in _files_of(outputs)}
     display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)
     try:
-        with attached_viewer(outputs.live_view), shown(err, display, quiet=quiet) as watch:
+        with attached_viewer(outputs.live_view), shown(err, display, quiet=told.quiet) as watch:
             report = start(watch)
     except RunFailed as failure:
         before = dict.fromkeys(_files_of(outputs)) | before
@@ -130,10 +117,10 @@ def execute(
         if about_a_file(failure.details) and (parameter := _named_by(failure, graph)) is not None:
             failure.add_note(f"name another with --set {parameter}=...")
         raise
-    if json:
+    if told.json:
         print_json({**report_json(report), "total_s": time.monotonic() - began})
     else:
-        print_report(out, report, total=time.monotonic() - began, verbose=verbose)
+        print_report(out, report, total=time.monotonic() - began, verbose=told.verbose)
     if outputs.open_file and outputs.view_file is not None:
         open_saved(outputs.view_file)
     if report.interrupted:

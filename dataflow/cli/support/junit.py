@@ -8,41 +8,30 @@ from __future__ import annotations
 
 import re
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
-from dataflow.verification.gate import Checked, Judged
+from dataflow.cli.support.verdicts import explain, reservations
+from dataflow.verification.gate import Checked
 
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that no XML document may hold."""
 
 
-def write_junit(
-    file: Path,
-    checked: Iterable[Checked],
-    explain: Callable[[Checked, Judged], Iterable[str]],
-    reservations: Callable[[Checked], Iterable[str]],
-) -> None:
-    """Writes the file. `explain` gives the lines about an operator that did not pass, `reservations` those about a
-    recording that did."""
+def write_junit(file: Path, checked: Iterable[Checked]) -> None:
+    """Writes the file."""
     root = ElementTree.Element("testsuites")
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
     for number, one in enumerate(checked):
-        root.append(_suite(number, one, now, explain, reservations))
+        root.append(_suite(number, one, now))
     ElementTree.indent(root)
     file.parent.mkdir(parents=True, exist_ok=True)
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 
-def _suite(
-    number: int,
-    one: Checked,
-    now: str,
-    explain: Callable[[Checked, Judged], Iterable[str]],
-    reservations: Callable[[Checked], Iterable[str]],
-) -> ElementTree.Element:
+def _suite(number: int, one: Checked, now: str) -> ElementTree.Element:
     failures = sum(not j.passed for j in one.judged)
     suite = ElementTree.Element(
         "testsuite",
@@ -57,26 +46,22 @@ def _suite(
         skipped="0",
         time=f"{one.wall:.3f}",
     )
-    properties = ElementTree.SubElement(suite, "properties")
-    ElementTree.SubElement(properties, "property", name="verdict", value=one.verdict)
+    facts: dict[str, str] = {"verdict": one.verdict}
     if one.report is not None:
-        for name, value in (("messages", one.report.messages), ("streams", one.report.streams)):
-            ElementTree.SubElement(properties, "property", name=name, value=str(value))
-        for fact, then, here in one.report.facts:
-            ElementTree.SubElement(
-                properties, "property", name=_clean(f"differs: {fact}"), value=_clean(f"{then} → {here}")
-            )
+        facts |= {"messages": str(one.report.messages), "streams": str(one.report.streams)}
+        facts |= {f"differs: {fact}": f"{then} → {here}" for fact, then, here in one.report.facts}
+    properties = ElementTree.SubElement(suite, "properties")
+    for name, value in facts.items():
+        ElementTree.SubElement(properties, "property", name=_clean(name), value=_clean(value))
     # The operators ran side by side: the time of one alone is not known, that of the suite is.
     for judged in one.judged:
         case = ElementTree.SubElement(
             suite, "testcase", name=_clean(judged.operator), classname=_clean(one.name), time="0"
         )
         if not judged.passed:
-            lines = list(explain(one, judged))
-            kind = judged.verdict.replace(" ", "_")
-            message = f"{judged.operator}: {judged.verdict}"
+            message, kind = f"{judged.operator}: {judged.verdict}", judged.verdict.replace(" ", "_")
             failure = ElementTree.SubElement(case, "failure", message=_clean(message), type=kind)
-            failure.text = _clean("\n".join(lines))
+            failure.text = _clean("\n".join(explain(one, judged)))
     if one.report is None:
         case = ElementTree.SubElement(
             suite, "testcase", name="verify", classname=_clean(one.name), time=f"{one.wall:.3f}"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,39 +161,22 @@ def interrupted_by_user(error: BaseException | None) -> bool:
     )
 
 
+_KNOWN = {
+    *("BaselineError", "BusError", "ChaosError", "ContractError", "EnvError", "FoxgloveError", "KeysError"),
+    *("MappingError", "MessageError", "NameFault", "NetworkError", "NotRunning", "OperatorImportError"),
+    *("ParameterError", "RecordingError", "RegistryError", "ReplayError", "SweepError", "ViewerError", "WrongCommand"),
+}
+"""Errors of this package whose messages tell users what they can do."""
+
+
 def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
-    from dataflow.chaos.plan import ChaosError
-    from dataflow.client.attach import Lost, NotRunning
-    from dataflow.environments import EnvError
+    from dataflow.client.attach import Lost
+    from dataflow.client.processes import NoAnswer, Refused
     from dataflow.execution.failure import OperatorFailure
-    from dataflow.graph import GraphError, OperatorImportError
-    from dataflow.interop.mapping import MappingError
-    from dataflow.machines.keys import KeysError
-    from dataflow.messages import MessageError
-    from dataflow.operator import ParameterError
-    from dataflow.recording import RecordingError
-    from dataflow.reexecution.recorded_run import ReplayError
+    from dataflow.graph import GraphError
     from dataflow.supervision.core.report import RunFailed
-    from dataflow.transport import BusError, NetworkError
-    from dataflow.transport.registry import RegistryError
 
-    known = (
-        BusError,
-        RecordingError,
-        ReplayError,
-        EnvError,
-        ParameterError,
-        MessageError,
-        OperatorImportError,
-        NotRunning,
-        RegistryError,
-        KeysError,
-        NetworkError,
-        ChaosError,
-        MappingError,
-    )
-    viewer = sys.modules.get("dataflow.view.process")  # importing it takes long; an error of it has imported it
     match error:
         case GraphError():
             return f"\n{error}", "", COULD_NOT_RUN
@@ -203,7 +186,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
                 details = ""  # the message names the file; where in the operator it was opened does not help
             message = "\n".join((str(error), *getattr(error, "__notes__", ())))
             return message, details, INTERRUPTED if error.interrupted else DIFFERENT
-        case Lost():
+        case Lost() | NoAnswer() | Refused():
             return str(error), "", DIFFERENT
         case OperatorFailure():  # of calls that are made again
             return str(error), error.traceback, COULD_NOT_RUN
@@ -211,9 +194,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
             return None
         case OSError() if error.strerror and error.filename:
             return f"{error.filename}: {error.strerror}", "", COULD_NOT_RUN
-        case _ if isinstance(error, known) or (viewer is not None and isinstance(error, viewer.ViewerError)):
-            return str(error), "", COULD_NOT_RUN
-    return None
+    ours = {kind.__name__ for kind in type(error).__mro__ if kind.__module__.startswith("dataflow.")}
+    return (str(error), "", COULD_NOT_RUN) if ours & _KNOWN else None
 
 
 _FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", "PermissionError", "SourceError")
@@ -224,6 +206,16 @@ def about_a_file(details: str) -> bool:
     lines = details.rpartition('\n  File "')[2].splitlines()
     raised = next((line for line in lines[1:] if not line.startswith(" ")), "")
     return details.startswith("Traceback") and raised.partition(":")[0].rpartition(".")[2] in _FILE_ERRORS
+
+
+@contextmanager
+def counting(what: str, *, hidden: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows on a terminal how many messages `what` has seen, unless it is `hidden`."""
+    if hidden or not err.is_terminal:
+        yield None
+        return
+    with err.status(what) as status:
+        yield lambda seen: status.update(f"{what} · {count(seen)} messages")
 
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:
@@ -242,6 +234,19 @@ def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) 
         number = column in right
         made.add_column(column, justify="right" if number else "left", no_wrap=number, overflow="fold")
     return made
+
+
+def facts_table(rows: Iterable[tuple[str, str, str]], title: str | None = None) -> Table:
+    """Names and values, each with its style, in two columns; names are whole where there is no title."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2))
+    grid.title, grid.title_justify, grid.title_style = title, "left", "bold"
+    grid.add_column(style="dim", no_wrap=title is None, overflow="fold")
+    grid.add_column(overflow="fold")
+    for name, value, style in rows:
+        grid.add_row(Text(name), Text(visible(value), style=style))
+    return grid
 
 
 def _one_line(cell: RenderableType | None) -> RenderableType | None:

@@ -19,7 +19,7 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from dataflow.cli.registry import Commands, paragraphs
-from dataflow.cli.support.arguments import FLAG
+from dataflow.cli.support.options import FLAG
 from dataflow.cli.support.output import COULD_NOT_RUN, TRACEBACK, err, fail, say, wants_traceback
 from dataflow.cli.support.values import take_plainly
 from dataflow.extras import missing_extra

@@ -2,154 +2,114 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from dataflow.cli.support.arguments import FLAG, number
+from dataflow.cli.support.arguments import number
+from dataflow.cli.support.options import option
 from dataflow.cli.support.output import fail
+from dataflow.cli.support.storage import OUTPUT
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
 
-PLACEMENT, OUTPUT = "Placement", "Results"
+PLACEMENT = "Placement"
+TIMEOUT = 120.0
+"""Seconds without any progress after which a run is given up."""
 
-OneProcess = Annotated[
-    bool,
-    typer.Option("--one-process", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run all operators in one process."),
-]
-ProcessEach = Annotated[
-    bool,
-    typer.Option(
-        "--process-each", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run every operator in a separate process."
-    ),
-]
-Place = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--place",
-        metavar="OPERATOR=PROCESS",
-        rich_help_panel=PLACEMENT,
-        help="Run OPERATOR in the process of that name. May be repeated.",
-    ),
-]
-Record = Annotated[
-    Path | None,
-    typer.Option(
-        "--record", metavar="FILE.mcap", rich_help_panel=OUTPUT, help="Record the graph's streams and firings."
-    ),
-]
-Compression = Annotated[
-    Literal["zstd", "lz4", "none"] | None,
-    typer.Option(
-        "--compression",
-        metavar="zstd|lz4|none",
-        rich_help_panel=OUTPUT,
-        help="How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
-    ),
-]
-View = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="TARGET",
-        rich_help_panel=OUTPUT,
-        help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
-    ),
-]
-Open = Annotated[
-    bool,
-    typer.Option(
-        "--open",
-        metavar=FLAG,
-        rich_help_panel=OUTPUT,
-        help="With --view FILE.rrd: open the saved file in the viewer when there is a display.",
-    ),
-]
-Replace = Annotated[
-    bool,
-    typer.Option("--overwrite", metavar=FLAG, rich_help_panel=OUTPUT, help="Replace output files that exist."),
-]
-Json = Annotated[
-    bool,
-    typer.Option("--json", metavar=FLAG, rich_help_panel=OUTPUT, help="Print the report, digests included, as JSON."),
-]
+Replace = Annotated[bool, option("--overwrite", "Replace output files that exist.", OUTPUT)]
 Rate = Annotated[
     float | None,
-    typer.Option(
-        "--rate",
-        metavar="RATE",
+    option(
+        "--rate RATE",
+        "Pace: 1 is real time. Default: as fast as the graph goes.",
         parser=number(0.001, 1000, "1 is real time"),
-        help="Pace: 1 is real time. Default: as fast as the graph goes.",
     ),
 ]
-Step = Annotated[
-    bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
-]
+Step = Annotated[bool, option("--step", "Begin paused: → or n makes a step, space lets it go on.")]
 Listen = Annotated[
     str | None,
-    typer.Option(
-        "--listen",
-        metavar="ENDPOINT",
-        rich_help_panel=PLACEMENT,
-        help="Where other machines join, and tools with keys: tls/ADDRESS:PORT, with --keys.",
+    option(
+        "--listen ENDPOINT", "Where other machines join, and tools with keys: tls/ADDRESS:PORT, with --keys.", PLACEMENT
     ),
 ]
-Keys = Annotated[
-    Path | None,
-    typer.Option("--keys", metavar="FOLDER", rich_help_panel=PLACEMENT, help="This machine's keys (`dataflow keys`)."),
-]
-Here = Annotated[
-    bool,
-    typer.Option(
-        "--here", metavar=FLAG, rich_help_panel=PLACEMENT, help="Run everything here, without regard to `machine:`."
-    ),
-]
+Keys = Annotated[Path | None, option("--keys FOLDER", "This machine's keys (`dataflow keys`).", PLACEMENT)]
 Timeout = Annotated[
     float,
-    typer.Option(
-        "--timeout",
-        metavar="SECONDS",
+    option(
+        "--timeout SECONDS",
+        "Give up after so long without any progress, and when the operators take longer to be set up.",
         parser=number(0.1, 1e6, "seconds"),
-        help="Give up after so long without any progress, and when the operators take longer to be set up.",
     ),
 ]
-Live = Annotated[
-    bool,
-    typer.Option(
-        "--live",
-        metavar=FLAG,
-        help="Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
-        "`live:` policies say. Everything dropped is counted and recorded.",
-    ),
-]
-Paranoid = Annotated[
-    bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
-]
+Paranoid = Annotated[bool, option("--paranoid", "Catch operators that write into their inputs.")]
 MakeEffects = Annotated[
     bool,
-    typer.Option(
+    option(
         "--make-effects",
-        metavar=FLAG,
-        help="Make calls to services (`self.effect`) again. Their answers are compared, and the recorded ones given; a "
+        "Make calls to services (`self.effect`) again. Their answers are compared, and the recorded ones given; a "
         "call that is not recorded gets the new one.",
     ),
 ]
-LogLevel = Annotated[
-    str | None,
-    typer.Option(
-        "--log-level",
-        metavar="LEVEL",
-        help="The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
-        "Environment: DATAFLOW_LOG_LEVEL.",
-    ),
-]
-Verbose = Annotated[
-    bool,
-    typer.Option("--verbose", "-v", metavar=FLAG, help="Report every operator, every figure, every loss."),
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
+Verbose = Annotated[bool, option("--verbose -v", "Report every operator, every figure, every loss.")]
+Quiet = Annotated[bool, option("--quiet -q", "No progress display.")]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementOptions:
+    """Placement of operators in processes."""
+
+    one_process: Annotated[bool, option("--one-process", "Run all operators in one process.", PLACEMENT)] = False
+    process_each: Annotated[bool, option("--process-each", "Run every operator in a separate process.", PLACEMENT)] = (
+        False
+    )
+    place: Annotated[
+        list[str] | None,
+        option("--place OPERATOR=PROCESS", "Run OPERATOR in the process of that name. May be repeated.", PLACEMENT),
+    ] = None
+
+    def placement(self, graph: Graph) -> Any:
+        """The `placement` of a run plan."""
+        if self.one_process + self.process_each + bool(self.place) > 1:
+            raise fail("--one-process, --process-each and --place exclude each other")
+        if not self.place:
+            return "one_process" if self.one_process else "process_each" if self.process_each else "graph"
+        placement = {}
+        for word in self.place:
+            operator, separator, process = word.partition("=")
+            if not separator or not process or operator not in graph.nodes:
+                known = ", ".join(graph.nodes)
+                raise fail(f"--place {word!r}: expected OPERATOR=PROCESS with an operator of the graph ({known})")
+            placement[operator] = process
+        return placement
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """The viewer of a run."""
+
+    view: Annotated[
+        str | None,
+        option(
+            "--view TARGET",
+            "spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
+            OUTPUT,
+        ),
+    ] = None
+    open_saved: Annotated[
+        bool,
+        option("--open", "With --view FILE.rrd: open the saved file in the viewer when there is a display.", OUTPUT),
+    ] = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOptions:
+    """Output of a run on the terminal."""
+
+    quiet: Quiet = False
+    verbose: Verbose = False
+    json: Annotated[bool, option("--json", "Print the report, digests included, as JSON.", OUTPUT)] = False
 
 
 def machines_of(

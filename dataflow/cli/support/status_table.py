@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -247,40 +247,30 @@ def _lag(row: Row) -> Text:
 
 # Lines
 
-_COLUMNS = (("state", 10), ("Hz", 7), ("dropped", 9), ("timeouts", 8), ("late", 7), ("CPU", 5), ("wall", 5))
+_COLUMNS: tuple[tuple[str, str, Callable[[Row], str]], ...] = (
+    ("state", "<10", lambda row: row.state),
+    ("Hz", ">7", lambda row: f"{row.rate:.1f}"),
+    ("dropped", ">9", lambda row: count(row.dropped)),
+    ("timeouts", ">8", lambda row: count(row.timeouts)),
+    ("late", ">7", lambda row: count(row.late)),
+    ("CPU", ">5", lambda row: f"{row.load:.0%}"),
+    ("wall", ">5", lambda row: f"{row.wall:.0%}"),
+    ("restarts", ">8", lambda row: str(row.restarts)),
+    ("lag", ">8", lambda row: _lag(row).plain),
+)
+"""Headings, widths and texts."""
 
 
 def heading(sample: Sample) -> str:
     """The names of what `line` prints."""
-    names = (f"{name:<{width}}" if name == "state" else f"{name:>{width}}" for name, width in _COLUMNS)
-    return "  ".join((f"{'time':>8}", f"{'operator':<{_width(sample)}}", *names, f"{'restarts':>8}", f"{'lag':>8}"))
+    names = (f"{name:{width}}" for name, width, _ in _COLUMNS)
+    return "  ".join((f"{'time':>8}", f"{'operator':<{_width(sample)}}", *names))
 
 
 def line(row: Row, sample: Sample, running: float) -> str:
     """One operator at one moment, `running` seconds after the graph began."""
-    cells = (
-        row.state,
-        f"{row.rate:.1f}",
-        count(row.dropped),
-        count(row.timeouts),
-        count(row.late),
-        f"{row.load:.0%}",
-        f"{row.wall:.0%}",
-    )
-    lag = row.lag if row.behind_clock is None else row.behind_clock
-    padded = (
-        f"{cell:<{width}}" if name == "state" else f"{cell:>{width}}"
-        for cell, (name, width) in zip(cells, _COLUMNS, strict=True)
-    )
-    return "  ".join(
-        (
-            f"{running:>8.1f}",
-            f"{row.operator:<{_width(sample)}}",
-            *padded,
-            f"{row.restarts:>8}",
-            f"{'' if lag is None else seconds(lag):>8}",
-        )
-    ).rstrip()
+    cells = (f"{text(row):{width}}" for _, width, text in _COLUMNS)
+    return "  ".join((f"{running:>8.1f}", f"{row.operator:<{_width(sample)}}", *cells)).rstrip()
 
 
 def _width(sample: Sample) -> int:

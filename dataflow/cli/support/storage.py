@@ -3,70 +3,83 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from dataflow.cli.support.arguments import output_file
+from dataflow.cli.support.options import option
 from dataflow.cli.support.output import fail
 from dataflow.cli.support.quantities import parsed_duration, parsed_size
 
 if TYPE_CHECKING:
     from dataflow.recording.parts import Splitting, Storage
 
-RECORDING = "Recording"
+OUTPUT, RECORDING = "Results", "Recording"
 PARTS_KEPT = 10
 """Parts into which the bytes to keep are divided, where no size of one is given."""
 
 SplitEvery = Annotated[
     str | None,
-    typer.Option(
-        "--split-every",
-        metavar="TIME",
-        rich_help_panel=RECORDING,
-        help="A new file, NAME_000.mcap and so on, after this event time: 60s, 5min.",
-    ),
+    option("--split-every TIME", "A new file, NAME_000.mcap and so on, after this event time: 60s, 5min.", RECORDING),
 ]
-SplitSize = Annotated[
-    str | None,
-    typer.Option(
-        "--split-size",
-        metavar="SIZE",
-        rich_help_panel=RECORDING,
-        help="A new file after so many bytes: 500MB, 2GB.",
-    ),
-]
-KeepDisk = Annotated[
-    str | None,
-    typer.Option(
-        "--keep-disk",
-        metavar="SIZE",
-        rich_help_panel=RECORDING,
-        help="Delete the oldest files of this recording while all of them take more than this: 20GB. It is split by "
-        "a tenth of that, or by --split-size.",
-    ),
-]
-OnFailure = Annotated[
-    Literal["go_on", "end"] | None,
-    typer.Option(
-        "--record-failure",
-        metavar="go_on|end",
-        rich_help_panel=RECORDING,
-        help="When the disk is full or the recorder fails: the run goes on, and what is lost is counted (default of a "
-        "live run), or it ends (default of any other).",
-    ),
-]
+SplitSize = Annotated[str | None, option("--split-size SIZE", "A new file after so many bytes: 500MB, 2GB.", RECORDING)]
 Readable = Annotated[
     Literal["owner", "group", "all"],
-    typer.Option(
-        "--readable",
-        metavar="owner|group|all",
-        rich_help_panel=RECORDING,
-        help="Who may read the files that are written. Default: you alone.",
-    ),
+    option("--readable owner|group|all", "Who may read the files that are written. Default: you alone.", RECORDING),
 ]
 MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """The recording of a run, and how its files are stored."""
+
+    record: Annotated[Path | None, option("--record FILE.mcap", "Record the graph's streams and firings.", OUTPUT)] = (
+        None
+    )
+    compression: Annotated[
+        Literal["zstd", "lz4", "none"] | None,
+        option(
+            "--compression zstd|lz4|none",
+            "How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
+            OUTPUT,
+        ),
+    ] = None
+    split_every: SplitEvery = None
+    split_size: SplitSize = None
+    keep_disk: Annotated[
+        str | None,
+        option(
+            "--keep-disk SIZE",
+            "Delete the oldest files of this recording while all of them take more than this: 20GB. It is split "
+            "by a tenth of that, or by --split-size.",
+            RECORDING,
+        ),
+    ] = None
+    record_failure: Annotated[
+        Literal["go_on", "end"] | None,
+        option(
+            "--record-failure go_on|end",
+            "When the disk is full or the recorder fails: the run goes on, and what is lost is counted (default "
+            "of a live run), or it ends (default of any other).",
+            RECORDING,
+        ),
+    ] = None
+    readable: Readable = "owner"
+
+    def storage(self, *, flight: bool = False) -> Storage:
+        """Storage of the recording; ends the command where nothing is recorded. `flight`: a flight recorder does."""
+        from dataflow.recording.parts import Storage
+
+        whole = {"--split-every": self.split_every, "--split-size": self.split_size, "--keep-disk": self.keep_disk}
+        either = {"--record-failure": self.record_failure, "--compression": self.compression}
+        for name, given in (whole if flight else {**whole, **either}).items():
+            if given is not None and self.record is None:
+                raise fail(f"{name} is of a recording: name one with --record")
+        kept = None if self.keep_disk is None else parsed_size("--keep-disk", self.keep_disk)
+        splitting = splitting_of(self.split_every, self.split_size, self.keep_disk)
+        return Storage(splitting, kept, self.record_failure, MODES[self.readable])
 
 
 def named(path: Path) -> Path:
@@ -109,25 +122,3 @@ def splitting_of(every: str | None, size: str | None, keep: str | None = None) -
             raise fail(f"--keep-disk {keep} holds less than two files of --split-size {size}")
         most = most or max(whole // PARTS_KEPT, 1)
     return Splitting(most, time_ns)
-
-
-def storage_of(
-    record: Path | None,
-    every: str | None,
-    size: str | None,
-    keep: str | None,
-    on_failure: Literal["go_on", "end"] | None,
-    readable: str,
-    *,
-    flight: bool = False,
-) -> Storage:
-    """The storage of a run's recording, by the options, which are refused where nothing is recorded."""
-    from dataflow.recording.parts import Storage
-
-    for option, given in (("--split-every", every), ("--split-size", size), ("--keep-disk", keep)):
-        if given is not None and record is None:
-            raise fail(f"{option} is of a recording: name one with --record")
-    if on_failure is not None and record is None and not flight:
-        raise fail("--record-failure is of a recording: name one with --record")
-    kept = None if keep is None else parsed_size("--keep-disk", keep)
-    return Storage(splitting_of(every, size, keep), kept, on_failure, MODES[readable])

@@ -52,13 +52,10 @@ def print_one(console: Console, checked: Checked) -> None:
         verdicts.add_row(Text(judged.operator), *row, Text(judged.verdict, style=STYLES[judged.verdict]))
     console.print(verdicts)
     told = [line for judged in checked.judged for line in explain(checked, judged)]
-    for line in dict.fromkeys([*told, *_notes(report)]):
-        console.print(Text(line), soft_wrap=True)
-    if said := _cut(report):
-        console.print(Text(said, style="yellow"), soft_wrap=True)
+    _print(console, dict.fromkeys([*told, *_notes(report)]))
+    _print(console, filter(None, [_cut(report)]), "yellow")
     if not report.identical:
-        for line in fact_lines(report):
-            console.print(Text(line, style="dim"), soft_wrap=True)
+        _print(console, fact_lines(report), "dim")
     if checked.runs > 1:
         console.print(Text(_runs(checked)))
     console.print(Text.assemble((checked.verdict, STYLES[checked.verdict]), _conclusion(checked, report)))
@@ -79,27 +76,24 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
         )
     console.print(summary)
     for checked in all_checked:
-        if checked.passed:
-            if lines := list(reservations(checked)):
-                console.print(Text(checked.name, style="bold"))
-                for line in lines:
-                    console.print(Text(f"  {line}"), soft_wrap=True)
-            continue
-        console.print(Text(checked.name, style="bold"))
-        if checked.report is None:
-            console.print(Text(f"  {checked.error}"), soft_wrap=True)
-            continue
         told = [line for judged in checked.judged if not judged.passed for line in explain(checked, judged)]
-        for line in dict.fromkeys([*told, *reservations(checked)]):
-            console.print(Text(f"  {line}"), soft_wrap=True)
-        for line in fact_lines(checked.report):
-            console.print(Text(f"  {line}", style="dim"), soft_wrap=True)
+        lines = dict.fromkeys([*told, *reservations(checked)]) if checked.report is not None else [checked.error]
+        if lines or not checked.passed:
+            console.print(Text(checked.name, style="bold"))
+        _print(console, (f"  {line}" for line in lines))
+        if checked.report is not None and not checked.passed:
+            _print(console, (f"  {line}" for line in fact_lines(checked.report)), "dim")
     passed = sum(c.passed for c in all_checked)
     failed = {verdict: sum(c.verdict == verdict for c in all_checked) for verdict in STYLES}
     rest = [f"{n} {verdict}" for verdict, n in failed.items() if n and verdict not in ("identical",)]
     style = "green" if passed == len(all_checked) else "bold red"
     total = plural(len(all_checked), "recording")
     console.print(Text.assemble((f"{passed} of {total} passed", style), f" ({', '.join(rest)})" if rest else ""))
+
+
+def _print(console: Console, lines: Iterable[str], style: str = "") -> None:
+    for line in lines:
+        console.print(Text(line, style=style), soft_wrap=True)
 
 
 def reservations(checked: Checked) -> Iterator[str]:
@@ -119,14 +113,9 @@ def print_completion(console: Console, made: Completion) -> None:
     """Prints what was computed and stored; or which operator differs, and where."""
     for v in made.operators:
         if v.first is not None:
-            lines = [
-                *_difference(v, v.first, None),
-                f"  {v.operator} is {'the culprit' if v.verdict == 'culprit' else 'downstream'}",
-            ]
-            for line in lines:
-                console.print(Text(line), soft_wrap=True)
-        for line in _left_out(v):
-            console.print(Text(line), soft_wrap=True)
+            _print(console, _difference(v, v.first, None))
+            _print(console, [f"  {v.operator} is {'the culprit' if v.verdict == 'culprit' else 'downstream'}"])
+        _print(console, _left_out(v))
     if not made.stored:
         culprits = [v.operator for v in made.operators if v.verdict == "culprit"]
         at = f"look at {', '.join(culprits)}" if culprits else "see above"
@@ -142,8 +131,8 @@ def print_completion(console: Console, made: Completion) -> None:
     )
     if made.kept:
         told = f"{plural(made.kept, 'message')} could not be made again and were taken over as recorded"
-        console.print(Text(told, style="yellow"), soft_wrap=True)
-    console.print(Text(f"computed again: {', '.join(made.added) or 'nothing that was not recorded'}"), soft_wrap=True)
+        _print(console, [told], "yellow")
+    _print(console, [f"computed again: {', '.join(made.added) or 'nothing that was not recorded'}"])
 
 
 def explain(checked: Checked, judged: Judged) -> Iterator[str]:

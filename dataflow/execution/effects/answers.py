@@ -27,10 +27,8 @@ class EffectError(ValueError):
 
 
 class EffectMiss(BaseException):
-    """Raised in a re-execution for a call whose answer is not recorded.
-
-    Not an `Exception`: an operator that goes on without a service must not take a miss for a failure of the service.
-    """
+    """Raised in a re-execution for a call whose answer is not recorded. Not an `Exception`: an operator that goes on
+    without a service must not take a miss for a failure of the service."""
 
 
 @dataclass(frozen=True, slots=True)

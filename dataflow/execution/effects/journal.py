@@ -53,10 +53,8 @@ class Journal:
 
 
 class RecordedJournal(Journal):
-    """Gives recorded answers. With `make`, calls are made again and compared, and a miss gets the new answer.
-
-    `counts`: by name of a call and what was done.
-    """
+    """Gives recorded answers. With `make`, calls are made again and compared, and a miss gets the new answer. `counts`:
+    by name of a call and what was done."""
 
     def __init__(self, *, make: bool = False) -> None:
         super().__init__()

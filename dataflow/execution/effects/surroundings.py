@@ -30,9 +30,7 @@ _SEVERAL = (tuple, list, set, frozenset, Mapping)
 
 def surroundings(call: Callable[..., Any]) -> dict[str, Any]:
     """Returns values by place, such as `closure.prompt`, `default.prompt`, `self.prompt`: those that may have a digest.
-
-    Not: attributes that are named as credentials, objects of libraries, module variables, the code itself.
-    """
+    Not: attributes that are named as credentials, objects of libraries, module variables, the code itself."""
     found: dict[str, Any] = {}
     bound = getattr(call, "__self__", None)
     if bound is not None and not isinstance(bound, ModuleType):

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dataflow.execution.feeds.playable import PlayableStreams
-from dataflow.execution.feeds.promises import promises
 from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import Emitter
 from dataflow.execution.work import Work
@@ -51,7 +50,7 @@ class LogFeed:
     `streams` maps each stream to the node that made it. `finals` holds the stamps that streams ended with in the
     recorded run, where known. `start` and `end` (ns, inclusive) cut the recording; static streams are always given.
     A stream whose clock went back in the recorded run begins its next incarnation where that one did: what it promises
-    holds all the same (`dataflow.execution.feeds.promises`).
+    holds all the same (`promises`).
     """
 
     def __init__(
@@ -64,23 +63,27 @@ class LogFeed:
         finals: Mapping[str, int],
         start: int | None = None,
         end: int | None = None,
-        numbered: Callable[[Iterable[Recorded]], Iterable[Recorded]] = iter,
+        messages: Iterable[Recorded] | None = None,
     ) -> None:
-        """`numbered` gives the messages their numbers; by default they keep the recorded ones."""
+        """`messages`: what is given in place of all that the recording holds of the streams."""
         self.recording, self.emitter = recording, emitter
         self._ports, self._start = ports, start
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
             name: _LoggedStream(
-                name, node, self._final(name, finals, end), self._place(name, node), self._promises(name, start, end)
+                name,
+                node,
+                self._final(name, finals, end),
+                ports[node].index(name) if name in ports[node] else None,
+                self._promises(name, start, end),
             )
             for name, node in streams.items()
             if name not in self._static
         }
         self._first_end = self._least_final()
         self._nodes = dict(streams)
-        self._messages = iter(numbered(recording.messages(streams=list(streams), start=start, end=end)))
+        self._messages = iter(recording.messages(list(streams), start, end) if messages is None else messages)
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
         self.last = NEVER
@@ -101,10 +104,6 @@ class LogFeed:
         last = self.recording.streams[name].last
         final = max(finals.get(name, NEVER), NEVER if last is None else last)
         return final if end is None else min(final, end)
-
-    def _place(self, name: str, node: str) -> int | None:
-        ports = self._ports[node]
-        return ports.index(name) if name in ports else None
 
     def _least_final(self) -> int:
         return min((state.final for state in self._streams.values() if not state.ended), default=FOREVER)
@@ -221,3 +220,35 @@ class LogFeed:
             yield name, digest.count, digest.hexdigest()
         for state in self._streams.values():
             yield state.name, state.count, state.digest.hexdigest()
+
+
+def promises(stamps: Sequence[int]) -> list[int]:
+    """Returns the largest frontier that may be promised when the first k messages have been given, for k = 0, 1, ...
+    `stamps`: of all messages, in the order of the stream. `NEVER`: nothing beyond the message itself."""
+    reached = [NEVER]
+    for stamp in stamps:
+        reached.append(max(reached[-1], stamp))
+    found = [FOREVER]
+    following = FOREVER
+    """The first stamp to come that is not late, less 1."""
+    for k in range(len(stamps) - 1, -1, -1):
+        if stamps[k] > reached[k]:
+            following = stamps[k] - 1
+        caught_up = k == 0 or stamps[k - 1] == reached[k]
+        found.append(following if caught_up else NEVER)
+    return found[::-1]
+
+
+def gapless(messages: Iterable[Recorded]) -> Iterator[Recorded]:
+    """Numbers the messages of each stream without the gaps that a recording may have.
+
+    A gap means to a process that messages were lost on their way to it, but messages that a recording lacks were never
+    sent. The first message of a stream keeps its number, another incarnation begins with 0.
+    """
+    due: dict[str, tuple[int, int]] = {}
+    for item in messages:
+        incarnation, number = due.get(item.stream, (item.incarnation, item.seq))
+        if item.incarnation != incarnation:
+            number = 0
+        due[item.stream] = item.incarnation, number + 1
+        yield item if item.seq == number else replace(item, seq=number)

@@ -12,10 +12,8 @@ from dataflow.recording.streams.streams import StreamInfo
 
 
 class PlayableStreams(Protocol):
-    """Streams of messages by name, read in the order of stamps: a recording, or a bag of another system.
-
-    `metadata`: the file's description of the run that made it, as recordings have it; empty where there was none.
-    """
+    """Streams of messages by name, read in the order of stamps: a recording, or a bag of another system. `metadata`:
+    the file's description of the run that made it, as recordings have it; empty where there was none."""
 
     path: Path
     streams: Mapping[str, StreamInfo]
@@ -41,10 +39,8 @@ class PlayableStreams(Protocol):
 
 
 def span_of(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] | None:
-    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message.
-
-    Of a part of a recording, what lies outside of its span is left out.
-    """
+    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message. Of a part
+    of a recording, what lies outside of its span is left out."""
     infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
     firsts = [info.first for info in infos if info.first is not None]
     lasts = [info.last for info in infos if info.last is not None]

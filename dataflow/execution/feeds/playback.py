@@ -13,9 +13,7 @@ SLOWEST, FASTEST = 1 / 64, 64.0
 
 class Playback:
     """Decides whether a feed may give its next step (all messages of one stamp), and how fast event time passes.
-
-    `speed`: event time against the clock, 1.0 is real time; None: as fast as the graph goes.
-    """
+    `speed`: event time against the clock, 1.0 is real time; None: as fast as the graph goes."""
 
     def __init__(self, *, paused: bool = False, speed: float | None = None) -> None:
         self.paused = paused

@@ -107,10 +107,8 @@ def give_back(held: Held) -> None:
 
 
 def peek() -> tuple[object, ...]:
-    """Returns a value that differs after a draw, and does not seed the generator.
-
-    While a seed is pending the value is a number, since a draw settles the seed; copying the state takes 30 µs.
-    """
+    """Returns a value that differs after a draw, and does not seed the generator. While a seed is pending the value is
+    a number, since a draw settles the seed; copying the state takes 30 µs."""
     settled = _LOCK.settled
     if mtrand._rand._bit_generator is _GENERATOR:
         if _LOCK.pending is not None:

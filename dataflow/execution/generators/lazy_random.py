@@ -51,10 +51,8 @@ def _change_class(to: type[random.Random]) -> None:
 
 
 def peek() -> tuple[object, ...]:
-    """Returns a value that differs after a draw, and does not seed the generator.
-
-    While a seed is pending the value is a number, since a draw settles the seed; copying the state takes 10 µs.
-    """
+    """Returns a value that differs after a draw, and does not seed the generator. While a seed is pending the value is
+    a number, since a draw settles the seed; copying the state takes 10 µs."""
     if _GENERATOR.__class__ is _Pending:
         return (_STATE.settled,)
     return _STATE.settled, _random.Random.getstate(_GENERATOR)

@@ -45,6 +45,7 @@ class Streams:
             if len(later) == len(waiting):
                 for alias in later:
                     self.no_match(alias.pattern, f"output {alias.key.rpartition('/')[2]!r}", None)
+                    self.expansion.broken.append(alias.key)
                 return
             waiting = later
 

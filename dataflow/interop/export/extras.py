@@ -8,10 +8,9 @@ from itertools import zip_longest
 
 from mcap.writer import Writer
 
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.interop.unpacking import Unpacked
 from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.recording.mcap.attachments import Attachment, names_once, tells_of_run
 from dataflow.recording.mcap.index import McapFile
@@ -22,16 +21,16 @@ ROSBAG2 = "rosbag2"
 
 
 class Extras:
-    """Attachments and metadata records of a material's files, under the names that they get in one file.
+    """Attachments and metadata records of a source's files, under the names that they get in one file.
 
     Of several files (a split bag), what they hold equally is there once, and other content of one name is called
     `FILE/NAME`. `runs`: metadata records that describe a run of ours, which a conversion does not keep.
     """
 
-    def __init__(self, material: Material) -> None:
-        files = material.bag.files if isinstance(material.bag, McapBag | Unpacked) else ()
+    def __init__(self, source: ExportSource) -> None:
+        files = source.bag.files if isinstance(source.bag, McapBag) else ()
         self._files = list(files)
-        listed = [[(n, v) for n, v in f.metadata if material.foreign or not tells_of_run(n)] for f in files]
+        listed = [[(n, v) for n, v in f.metadata if source.foreign or not tells_of_run(n)] for f in files]
         names_of_all = {name for f in files for name, _ in f.metadata}
         kept = {name for one in listed for name, _ in one}
         self.runs = len(names_of_all - kept - RESERVED_METADATA)
@@ -66,9 +65,9 @@ def _renamed(file: McapFile, names: Collection[str | None]) -> Iterator[Attachme
             yield replace(file.attachment(place), name=name)
 
 
-def carry(material: Material, writer: Writer, done: Exported, *, without: Collection[str] = ()) -> None:
+def carry(source: ExportSource, writer: Writer, done: Exported, *, without: Collection[str] = ()) -> None:
     """Writes attachments and metadata records into an MCAP file; records called as in `without` are left out."""
-    extras = Extras(material)
+    extras = Extras(source)
     for name, values in extras.metadata:
         if name in without:
             done.left_out[f"metadata {name}"] = "it describes the file that it was in, and is written anew"
@@ -81,9 +80,9 @@ def carry(material: Material, writer: Writer, done: Exported, *, without: Collec
     tell_runs(extras, done)
 
 
-def tell_left_out(material: Material, what: str, done: Exported) -> None:
+def tell_left_out(source: ExportSource, what: str, done: Exported) -> None:
     """Reports which attachments and metadata records a format has no place for."""
-    extras = Extras(material)
+    extras = Extras(source)
     for name in extras.names:
         done.left_out[f"attachment {name}"] = f"{what} has no place for it"
     for name, _ in extras.metadata:

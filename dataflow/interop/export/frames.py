@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from dataflow.interop.conversions import NARROWING, convert
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import (
     CameraInfo,
     CompressedDepth,
@@ -34,46 +35,46 @@ DEPTHS = (DepthImage, CompressedDepth)
 POSES = (Pose, Odometry)
 
 
-def optional(material: Material, *types: type[Message]) -> str | None:
+def optional(source: ExportSource, *types: type[Message]) -> str | None:
     """The one stream of some types, None where there is none; raises `RecordingError` for several."""
-    return material.only("the format", *types) if material.of_type(*types) else None
+    return source.only("the format", *types) if source.of_type(*types) else None
 
 
-def frame_of(material: Material, stream: str) -> str:
+def frame_of(source: ExportSource, stream: str) -> str:
     """The frame of a stream's first message."""
-    first = next(material.messages([stream]), None)
+    first = next(source.messages([stream]), None)
     return "" if first is None else str(getattr(first.message, "frame", ""))
 
 
 def calibration(
-    material: Material, frame: str, done: Exported, *, among: Sequence[str] | None = None, alone: bool = False
+    source: ExportSource, frame: str, done: Exported, *, among: Sequence[str] | None = None, alone: bool = False
 ) -> CameraInfo | None:
     """The first calibration of a camera's frame, counted as written; what of its lens has no place is counted as lost.
     `among`: streams of calibrations; `alone`: the only one there is will do, whatever its frame."""
-    streams = material.of_type(CameraInfo) if among is None else among
-    infos = [(name, recorded.message) for name in streams for recorded in material.messages([name])]
+    streams = source.of_type(CameraInfo) if among is None else among
+    infos = [(name, recorded.message) for name in streams for recorded in source.messages([name])]
     chosen = [(name, info) for name, info in infos if getattr(info, "frame", "") == frame]
     chosen = chosen or (infos if alone and len(infos) == 1 else [])
     for name, info in chosen[:1]:
         assert isinstance(info, CameraInfo)
-        done.count(material.names[name])
+        done.count(source.names[name])
         if info.distortion is not None and info.distortion.any():
-            done.lose(material.names[name], f"the distortion of its lens ({info.distortion_model})")
+            done.lose(source.names[name], f"the distortion of its lens ({info.distortion_model})")
         return info
     return None
 
 
-def messages_as(material: Material, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:
+def messages_as(source: ExportSource, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:
     """The messages of a stream as one type; images of 16 bits stay such, since PNG holds them."""
-    for recorded in material.messages([stream]) if stream is not None else ():
-        message = as_kind(material, recorded, kind, done)
+    for recorded in source.messages([stream]) if stream is not None else ():
+        message = as_kind(source, recorded, kind, done)
         if message is not None:
             yield message
 
 
-def as_kind(material: Material, recorded: Recorded, kind: type[Message], done: Exported) -> Any:
+def as_kind(source: ExportSource, recorded: Recorded, kind: type[Message], done: Exported) -> Any:
     """A message as another type, counted; None for a pose that is none, which is left out."""
-    name, message = material.names[recorded.stream], recorded.message
+    name, message = source.names[recorded.stream], recorded.message
     done.count(name)
     if (lost := NARROWING.get((type(message), kind))) is not None and not isinstance(message, Image16):
         done.lose(name, lost)
@@ -85,23 +86,23 @@ def as_kind(material: Material, recorded: Recorded, kind: type[Message], done: E
 
 
 def together(
-    material: Material, anchor: str, others: Mapping[str, type[Message]], done: Exported
+    source: ExportSource, anchor: str, others: Mapping[str, type[Message]], done: Exported
 ) -> Iterator[tuple[Recorded, dict[str, Any]]]:
     """Each message of a stream with the nearest one of every other, as its type, if there is one within `PAIR_WITHIN`;
     of two as near the earlier. Messages are held as long as one that is to come may be near them.
     """
     waiting: deque[Recorded] = deque()
     held: dict[str, deque[Any]] = {stream: deque() for stream in others}
-    for recorded in chain(material.messages([anchor, *others]), [None]):
+    for recorded in chain(source.messages([anchor, *others]), [None]):
         now = None if recorded is None else recorded.message.stamp
         while waiting and (now is None or waiting[0].message.stamp + PAIR_WITHIN < now):
             first = waiting.popleft()
-            yield first, {stream: _nearest(messages, first.message.stamp) for stream, messages in held.items()}
+            yield first, {stream: nearest(messages, first.message.stamp) for stream, messages in held.items()}
         if recorded is None or now is None:
             return
         if recorded.stream == anchor:
             waiting.append(recorded)
-        elif (message := as_kind(material, recorded, others[recorded.stream], done)) is not None:
+        elif (message := as_kind(source, recorded, others[recorded.stream], done)) is not None:
             held[recorded.stream].append(message)
         oldest = waiting[0].message.stamp if waiting else now
         for messages in held.values():
@@ -109,9 +110,13 @@ def together(
                 messages.popleft()
 
 
-def _nearest(messages: Iterable[Any], stamp: int) -> Any | None:
-    found = min(messages, key=lambda message: abs(message.stamp - stamp), default=None)
-    return found if found is not None and abs(found.stamp - stamp) <= PAIR_WITHIN else None
+def nearest(messages: Sequence[Any], stamp: int) -> Any:
+    """The message nearest to a stamp, of two as near the earlier; None without one within `PAIR_WITHIN`."""
+    at = bisect_left(messages, stamp, key=lambda m: m.stamp)
+    near = min(
+        (messages[k] for k in (at - 1, at) if 0 <= k < len(messages)), key=lambda m: abs(m.stamp - stamp), default=None
+    )
+    return near if near is not None and abs(near.stamp - stamp) <= PAIR_WITHIN else None
 
 
 def write_png(path: Path, message: Image | Image16) -> None:

@@ -6,16 +6,15 @@ Geiger et al., "Vision meets robotics: the KITTI dataset", 2013; its `dataformat
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dataflow.interop.export.frames import PAIR_WITHIN, write_text
-from dataflow.interop.export.material import Material
+from dataflow.interop.export.frames import nearest, write_text
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import Imu, Message, NavSatFix, Odometry
 from dataflow.messages.geometry import quaternion_to_matrix, roll_pitch_yaw
 
@@ -28,7 +27,7 @@ KINDS: tuple[type[Message], ...] = (Imu, NavSatFix, Odometry)
 """The messages that a packet is made of."""
 
 
-def write_oxts(material: Material, stamps: Sequence[int], drive: Path, times: Any, done: Exported) -> str | None:
+def write_oxts(source: ExportSource, stamps: Sequence[int], drive: Path, times: Any, done: Exported) -> str | None:
     """Writes a packet for each of the frames' stamps, and returns the frame of the inertial unit; None without packets.
 
     A packet takes the reading (Imu with an orientation), the position (NavSatFix) and the velocity (Odometry in the
@@ -36,23 +35,23 @@ def write_oxts(material: Material, stamps: Sequence[int], drive: Path, times: An
     `done.left_out` names it; a recording without readings and positions is not expected to have packets.
     `times`: writes stamps as KITTI does.
     """
-    if not material.of_type(Imu) and not material.of_type(NavSatFix):
+    if not source.of_type(Imu) and not source.of_type(NavSatFix):
         return None
     found: list[list[Any]] = []
     for kind in KINDS:
-        names = material.of_type(kind)
+        names = source.of_type(kind)
         if len(names) != 1:
-            given = ", ".join(material.names[n] for n in names)
+            given = ", ".join(source.names[n] for n in names)
             what = f"several streams of {kind.__name__} ({given}); choose with --stream" if names else (
                 f"no stream of {kind.__name__}"
             )  # fmt: skip
             done.left_out[OXTS] = f"it takes readings, positions and velocities, and there is {what}"
             return None
-        found.append([recorded.message for recorded in material.messages(names)])
+        found.append([recorded.message for recorded in source.messages(names)])
     rows: list[list[float]] = []
     taken: list[int] = []
     for number, stamp in enumerate(stamps):
-        near = [_nearest(messages, stamp) for messages in found]
+        near = [nearest(messages, stamp) for messages in found]
         lacking = [kind.__name__ for kind, message in zip(KINDS, near, strict=True) if message is None]
         fault = f"no {lacking[0]} within 20 ms" if lacking else _fault(*near)
         if not fault and near[0].stamp in taken[-1:]:
@@ -66,7 +65,7 @@ def write_oxts(material: Material, stamps: Sequence[int], drive: Path, times: An
         write_text(drive / OXTS / "data" / f"{number:010d}.txt", " ".join(map(_text, row)) + "\n", None)
     write_text(drive / OXTS / "timestamps.txt", times(taken), done)
     for kind, messages in zip(KINDS, found, strict=True):
-        name = material.names[material.of_type(kind)[0]]
+        name = source.names[source.of_type(kind)[0]]
         done.written[name] = len(rows)
         if len(messages) > len(rows):
             done.left_out[name] = f"{len(messages) - len(rows)} of {len(messages)}: one packet a frame"
@@ -105,13 +104,6 @@ def _fault(imu: Imu, fix: NavSatFix, odometry: Odometry) -> str:
     if not np.isfinite([fix.latitude, fix.longitude, fix.altitude]).all():
         return "a NavSatFix without a position"
     return ""
-
-
-def _nearest(messages: Sequence[Message], stamp: int) -> Any:
-    """The message nearest to a stamp; None without one within 20 ms."""
-    at = bisect_left(messages, stamp, key=lambda m: m.stamp)
-    near = min(messages[max(0, at - 1) : at + 1], key=lambda m: abs(m.stamp - stamp), default=None)
-    return near if near is not None and abs(near.stamp - stamp) <= PAIR_WITHIN else None
 
 
 def _text(value: float) -> str:

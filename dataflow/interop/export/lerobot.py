@@ -7,6 +7,7 @@ in the column `stamp`.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,8 +21,8 @@ from dataflow.extras import missing_extra
 from dataflow.interop.conversions import convert
 from dataflow.interop.export.frames import IMAGES
 from dataflow.interop.export.lerobot_layouts import Dataset, Layout, Layout21
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import CameraInfo, Image, Image16, Message, Transforms
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
@@ -73,7 +74,7 @@ class _Plan:
 
 
 def export_lerobot(
-    material: Material,
+    source: ExportSource,
     folder: Path,
     done: Exported,
     *,
@@ -91,13 +92,14 @@ def export_lerobot(
     except ImportError as error:
         raise RecordingError(f"a dataset of LeRobot needs pyarrow; {missing_extra(error)}") from None
     layout = layout or Layout21()
-    plan = _planned(material, action, done)
+    plan = _planned(source, action, done)
     stamps: list[int] = []
     path = folder / layout.table
     path.parent.mkdir(parents=True, exist_ok=True)
-    fps = _rate(material, plan.anchor)
+    fps = _rate(source, plan.anchor)
     writer: Any = None
-    for rows in _batches(_frames(material, plan, done)):
+    frames = _frames(source, plan, done)
+    for rows in iter(lambda: list(itertools.islice(frames, ROWS)), []):
         number = len(stamps)
         stamps += [stamp for stamp, _ in rows]
         columns = _columns(rows, plan, number, fps)
@@ -106,42 +108,40 @@ def export_lerobot(
             writer = pq.ParquetWriter(path, schema, compression="zstd")
         writer.write_table(pa.Table.from_pydict(columns, schema=schema))
     if writer is None:
-        raise RecordingError(f"{material.path}: no image of {material.names[plan.anchor]} has all others before it")
+        raise RecordingError(f"{source.path}: no image of {source.names[plan.anchor]} has all others before it")
     writer.close()
     if uneven := int((np.abs(np.diff(stamps) * (fps * 1e-9) - 1) > 0.5).sum()):
-        what = (
-            f"pauses and gaps between frames, which LeRobot has every {1 / fps:.3g} s (the column stamp has the times)"
-        )
-        done.lose(material.names[plan.anchor], what, uneven)
+        what = f"pauses and gaps between frames, which LeRobot has every {1 / fps:.3g} s"
+        done.lose(source.names[plan.anchor], f"{what} (the column stamp has the times)", uneven)
     done.files.append(str(path))
-    dataset = _described(plan, len(stamps), fps, task or material.path.stem)
+    dataset = _described(plan, len(stamps), fps, task or source.path.stem)
     done.files += [str(file) for file in layout.describe(folder, dataset)]
 
 
-def _planned(material: Material, action: str | None, done: Exported) -> _Plan:
-    cameras = material.of_type(*IMAGES)
+def _planned(source: ExportSource, action: str | None, done: Exported) -> _Plan:
+    cameras = source.of_type(*IMAGES)
     if not cameras:
-        raise RecordingError(f"{material.path}: LeRobot takes images; there are none among the streams chosen")
-    names = {outside: name for name, outside in material.names.items()}
+        raise RecordingError(f"{source.path}: LeRobot takes images; there are none among the streams chosen")
+    names = {outside: name for name, outside in source.names.items()}
     acting = None if action is None else names.get(action, action)
-    if acting is not None and acting not in material.streams:
-        raise RecordingError(f"{material.path}: no stream {action!r} for the action; there are {', '.join(names)}")
+    if acting is not None and acting not in source.streams:
+        raise RecordingError(f"{source.path}: no stream {action!r} for the action; there are {', '.join(names)}")
     images: dict[str, str] = {}
     for name in cameras:
-        key = f"observation.images.{material.names[name].strip('/').replace('/', '.')}"
+        key = f"observation.images.{source.names[name].strip('/').replace('/', '.')}"
         if (other := images.setdefault(key, name)) != name:
-            both = f"{material.names[other]} and {material.names[name]}"
-            raise RecordingError(f"{material.path}: {both} are both {key} in LeRobot: leave one out with --without")
+            both = f"{source.names[other]} and {source.names[name]}"
+            raise RecordingError(f"{source.path}: {both} are both {key} in LeRobot: leave one out with --without")
     states = []
-    for name, info in material.streams.items():
+    for name, info in source.streams.items():
         if name in cameras or name == acting:
             continue
         if info.static or info.message_type in (CameraInfo, Transforms):
-            done.left_out[material.names[name]] = "LeRobot has no place for calibrations and transforms"
+            done.left_out[source.names[name]] = "LeRobot has no place for calibrations and transforms"
             continue
-        first = next(material.messages([name]), None)
+        first = next(source.messages([name]), None)
         if first is None or not len(_numbers(first.message)[0]):
-            done.left_out[material.names[name]] = "it holds no numbers of which each message has as many"
+            done.left_out[source.names[name]] = "it holds no numbers of which each message has as many"
         else:
             states.append(name)
     return _Plan(cameras[0], images, states, acting)
@@ -165,12 +165,11 @@ def _numbers(message: Message) -> tuple[npt.NDArray[np.float64], list[str]]:
     return np.array(values), names
 
 
-def _frames(material: Material, plan: _Plan, done: Exported) -> Iterator[tuple[int, dict[str, Message]]]:
+def _frames(source: ExportSource, plan: _Plan, done: Exported) -> Iterator[tuple[int, dict[str, Message]]]:
     """(stamp, newest message by stream) for every image of the first camera that all others come before."""
     wanted = [*plan.images.values(), *plan.states, *([plan.action] if plan.action is not None else [])]
     newest: dict[str, Message] = {}
     now: int | None = None
-
     untaken: set[str] = set()
 
     def is_frame() -> bool:
@@ -178,35 +177,24 @@ def _frames(material: Material, plan: _Plan, done: Exported) -> Iterator[tuple[i
 
     def frame() -> dict[str, Message]:
         for name in untaken:
-            done.count(material.names[name])
+            done.count(source.names[name])
         untaken.clear()
         return dict(newest)
 
-    for recorded in material.messages(wanted):
+    for recorded in source.messages(wanted):
         if now is not None and recorded.stamp != now and is_frame():
             yield now, frame()
         now = recorded.stamp
         if recorded.stream in untaken:
-            done.lose(material.names[recorded.stream], UNTAKEN)
+            done.lose(source.names[recorded.stream], UNTAKEN)
         newest[recorded.stream] = recorded.message
         untaken.add(recorded.stream)
         if isinstance(recorded.message, Image16):
-            done.narrow(material.names[recorded.stream], "16 bits, and LeRobot's images have 8")
+            done.narrow(source.names[recorded.stream], "16 bits, and LeRobot's images have 8")
     if now is not None and is_frame():
         yield now, frame()
     for name in untaken:
-        done.lose(material.names[name], UNTAKEN)
-
-
-def _batches(frames: Iterator[tuple[int, dict[str, Message]]]) -> Iterator[list[tuple[int, dict[str, Message]]]]:
-    rows: list[tuple[int, dict[str, Message]]] = []
-    for frame in frames:
-        rows.append(frame)
-        if len(rows) == ROWS:
-            yield rows
-            rows = []
-    if rows:
-        yield rows
+        done.lose(source.names[name], UNTAKEN)
 
 
 def _columns(rows: list[tuple[int, dict[str, Message]]], plan: _Plan, first: int, fps: float) -> dict[str, list[Any]]:
@@ -267,9 +255,9 @@ def _vector(key: str, messages: list[Message], streams: list[str], plan: _Plan) 
     return [float(value) for value in values] if len(values) > 1 else float(values[0])
 
 
-def _rate(material: Material, stream: str) -> float:
+def _rate(source: ExportSource, stream: str) -> float:
     """Frames a second, a whole number where it is nearly one; from the median distance of images."""
-    stamps = np.array([m.stamp for m in material.messages([stream])])
+    stamps = np.array([m.stamp for m in source.messages([stream])])
     if len(stamps) < 2:
         return 1.0
     rate = 1e9 / float(np.median(np.diff(stamps)))

@@ -80,10 +80,7 @@ class Layout30:
     def describe(self, folder: Path, dataset: Dataset) -> list[Path]:
         """Writes what stands in `meta/`; the files."""
         info = dataset.info(
-            "v3.0",
-            data_files_size_in_mb=DATA_MB,
-            video_files_size_in_mb=VIDEO_MB,
-            data_path=f"data/{CHUNK}.parquet",
+            "v3.0", data_files_size_in_mb=DATA_MB, video_files_size_in_mb=VIDEO_MB, data_path=f"data/{CHUNK}.parquet"
         )
         statistics = {key: dict(values) for key, values in dataset.statistics.items()}
         return [

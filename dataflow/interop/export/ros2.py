@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,11 +10,13 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from ruamel.yaml import YAML
+from ruamel.yaml.scalarstring import LiteralScalarString
 
 from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
-from dataflow.interop.export.material import Material, distinct
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource, distinct
 from dataflow.interop.ros.made import typestore
 from dataflow.interop.ros.outward import OUTWARD
 from dataflow.interop.topics import UNIT
@@ -104,75 +105,54 @@ class Ros2Writer:
         """Finishes the file and writes metadata.yaml."""
         self.mcap.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
-        (self.folder / "metadata.yaml").write_text(self._metadata(), encoding="utf-8")
+        yaml = YAML()
+        yaml.width = 10_000
+        yaml.dump({"rosbag2_bagfile_information": self._metadata()}, self.folder / "metadata.yaml")
 
-    def _metadata(self) -> str:
-        first = 0 if self._first is None else self._first
-        total = sum(c.count for c in self._channels.values())
+    def _metadata(self) -> dict[str, Any]:
+        first, total = self._first or 0, sum(channel.count for channel in self._channels.values())
         span = self._last - first if total else 0
-        lines = [
-            "rosbag2_bagfile_information:",
-            "  version: 5",
-            "  storage_identifier: mcap",
-            "  duration:",
-            f"    nanoseconds: {span}",
-            "  starting_time:",
-            f"    nanoseconds_since_epoch: {first}",
-            f"  message_count: {total}",
-            "  topics_with_message_count:" if self._channels else "  topics_with_message_count: []",
-        ]
+
+        def times() -> dict[str, Any]:
+            return {"starting_time": {"nanoseconds_since_epoch": first}, "duration": {"nanoseconds": span}}
+
+        topics = []
         for (topic, _), channel in self._channels.items():
-            lines += [
-                "    - topic_metadata:",
-                f"        name: {json.dumps(topic)}",
-                f"        type: {channel.type}",
-                "        serialization_format: cdr",
-                "        offered_qos_profiles: |-",
-                *(f"          {line}" for line in channel.qos.splitlines()),
-                f"      message_count: {channel.count}",
-            ]
-        lines += [
-            '  compression_format: ""',
-            '  compression_mode: ""',
-            "  relative_file_paths:",
-            f"    - {json.dumps(self.file.name)}",
-            "  files:",
-            f"    - path: {json.dumps(self.file.name)}",
-            "      starting_time:",
-            f"        nanoseconds_since_epoch: {first}",
-            "      duration:",
-            f"        nanoseconds: {span}",
-            f"      message_count: {total}",
-        ]
-        return "\n".join(lines) + "\n"
+            about = {"name": topic, "type": channel.type, "serialization_format": "cdr"}
+            about["offered_qos_profiles"] = LiteralScalarString(channel.qos)
+            topics.append({"topic_metadata": about, "message_count": channel.count})
+        bag = {"version": 5, "storage_identifier": "mcap", **times(), "message_count": total}
+        bag |= {"topics_with_message_count": topics, "compression_format": "", "compression_mode": ""}
+        bag |= {"relative_file_paths": [self.file.name]}
+        return {**bag, "files": [{"path": self.file.name, **times(), "message_count": total}]}
 
 
-def export_ros2(material: Material, folder: Path, done: Exported) -> None:
+def export_ros2(source: ExportSource, folder: Path, done: Exported) -> None:
     """Writes a ROS 2 bag. Topics of ROS stay as they are, byte for byte (of ROS 1: field by field).
 
     Streams of messages become ROS messages. Those that come from a bag have the names of its topics again; of others,
     transforms are /tf and /tf_static, and each one else is a topic of its name. Raises `RecordingError`.
     """
-    ros = [t for t in material.bag.topics.values() if t.encoding in ("cdr", "ros1")]
-    chosen = {*material.streams, *(t.name for t in material.untouched)}
+    ros = [t for t in source.bag.topics.values() if t.encoding in ("cdr", "ros1")]
+    chosen = {*source.streams, *(t.name for t in source.untouched)}
     ros = [t for t in ros if t.name in chosen]
-    others = [name for name in material.streams if name not in {t.name for t in ros}]
-    for topic in material.untouched:
+    others = [name for name in source.streams if name not in {t.name for t in ros}]
+    for topic in source.untouched:
         if topic not in ros:
             done.left_out[topic.name] = f"{topic.encoding} messages of {topic.schema.name or 'no schema'}"
     writer = Ros2Writer(folder)
-    called = distinct([*(t.name for t in ros), *material.topics.values(), *material.names.values()], _ros_name)
+    called = distinct([*(t.name for t in ros), *source.topics.values(), *source.names.values()], _ros_name)
     try:
-        _copy(material, ros, called, writer, done)
-        _convert(material, others, called, writer, done)
-        carry(material, writer.mcap, done, without=(ROSBAG2,))
+        _copy(source, ros, called, writer, done)
+        _convert(source, others, called, writer, done)
+        carry(source, writer.mcap, done, without=(ROSBAG2,))
     finally:
         writer.close()
     done.files.append(str(folder))
 
 
 def _copy(
-    material: Material, topics: list[Topic], called: Mapping[str, str], writer: Ros2Writer, done: Exported
+    source: ExportSource, topics: list[Topic], called: Mapping[str, str], writer: Ros2Writer, done: Exported
 ) -> None:
     kinds: dict[str, RosType] = {}
     schemas: dict[str, SchemaText] = {}
@@ -189,8 +169,8 @@ def _copy(
             continue
         if topic.encoding == "ros1":
             kinds[topic.name] = kind
-    shift = material.shift
-    for stored in material.stored(list(schemas)):
+    shift = source.shift
+    for stored in source.stored(list(schemas)):
         kind_of = kinds.get(stored.topic)
         name = called[stored.topic]
         try:
@@ -204,25 +184,25 @@ def _copy(
 
 
 def _convert(
-    material: Material, names: list[str], called: Mapping[str, str], writer: Ros2Writer, done: Exported
+    source: ExportSource, names: list[str], called: Mapping[str, str], writer: Ros2Writer, done: Exported
 ) -> None:
     store = typestore()
     schemas: dict[str, SchemaText] = {}
     mapped = []
     for name in names:
-        kind = material.streams[name].message_type
+        kind = source.streams[name].message_type
         assert kind is not None
         if kind in OUTWARD:
             mapped.append(name)
         else:
-            done.left_out[material.names[name]] = f"{kind.SCHEMA} has no counterpart in ROS"
-    begin = material.first_stamp(mapped) or 0
-    for recorded in material.messages(mapped) if mapped else ():
+            done.left_out[source.names[name]] = f"{kind.SCHEMA} has no counterpart in ROS"
+    begin = source.first_stamp(mapped) or 0
+    for recorded in source.messages(mapped) if mapped else ():
         name = recorded.stream
-        static = material.streams[name].static
-        topic = _topic_of(material, name, called)
+        static = source.streams[name].static
+        topic = _topic_of(source, name, called)
         try:
-            message = _made(material.streams[name].metadata.get("type", ""), recorded.message)
+            message = _made(source.streams[name].metadata.get("type", ""), recorded.message)
         except RecordingError as error:
             done.lose(topic, str(error))
             continue
@@ -235,18 +215,18 @@ def _convert(
         except (struct.error, OverflowError, ValueError) as error:
             raise RecordingError(f"{name} at {recorded.stamp} does not fit into {kind_of}: {error}") from error
         unit = recorded.message.unit if isinstance(recorded.message, Number) else ""
-        writer.write(topic, schemas[kind_of], data, stamp - material.shift, latched=static, unit=unit)
+        writer.write(topic, schemas[kind_of], data, stamp - source.shift, latched=static, unit=unit)
         for lost in _lost(recorded.message):
             done.lose(topic, lost)
         done.count(topic)
 
 
-def _topic_of(material: Material, name: str, called: Mapping[str, str]) -> str:
-    if name in material.topics:
-        return called[material.topics[name]]
-    if material.streams[name].message_type is Transforms:
-        return "/tf_static" if material.streams[name].static else "/tf"
-    return called[material.names[name]]
+def _topic_of(source: ExportSource, name: str, called: Mapping[str, str]) -> str:
+    if name in source.topics:
+        return called[source.topics[name]]
+    if source.streams[name].message_type is Transforms:
+        return "/tf_static" if source.streams[name].static else "/tf"
+    return called[source.names[name]]
 
 
 def _made(recorded_as: str, message: Message) -> Any:

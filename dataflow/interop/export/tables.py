@@ -15,8 +15,8 @@ import numpy as np
 import xxhash
 
 from dataflow.extras import missing_extra
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import Message
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
@@ -59,41 +59,41 @@ def row_of(message: Message, columns: Mapping[str, Sequence[str]]) -> dict[str, 
     return row
 
 
-def export_csv(material: Material, folder: Path, done: Exported) -> None:
+def export_csv(source: ExportSource, folder: Path, done: Exported) -> None:
     """Writes `<stream>.csv`, slashes of the name as folders; stamps in ns, floats with all their digits."""
     with ExitStack() as files:
         writers: dict[str, tuple[Any, dict[str, list[str]]]] = {}
-        for name, columns in _tables(material, done):
-            path = file_of(folder, material.names[name], ".csv", done.files)
+        for name, columns in _tables(source, done):
+            path = file_of(folder, source.names[name], ".csv", done.files)
             file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
             names = ["stamp", *(column for group in columns.values() for column in group)]
             writer = csv.DictWriter(file, names)
             writer.writeheader()
             writers[name] = writer, columns
             done.files.append(str(path))
-        for recorded in material.messages(list(writers)) if writers else ():
+        for recorded in source.messages(list(writers)) if writers else ():
             writer, columns = writers[recorded.stream]
             writer.writerow(row_of(recorded.message, columns))
-            done.count(material.names[recorded.stream])
+            done.count(source.names[recorded.stream])
 
 
-def export_parquet(material: Material, folder: Path, done: Exported) -> None:
+def export_parquet(source: ExportSource, folder: Path, done: Exported) -> None:
     """Writes `<stream>.parquet`, zstd, a row group every 4,096 messages. Raises `RecordingError` without pyarrow."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
         raise RecordingError(f"--to parquet needs pyarrow; {missing_extra(error)}") from None
-    for name, columns in _tables(material, done):
-        path = file_of(folder, material.names[name], ".parquet", done.files)
-        kind = material.streams[name].message_type
+    for name, columns in _tables(source, done):
+        path = file_of(folder, source.names[name], ".parquet", done.files)
+        kind = source.streams[name].message_type
         assert kind is not None
         schema = pa.schema([("stamp", pa.int64()), *_types(pa, kind, columns)])
         with pq.ParquetWriter(path, schema, compression="zstd") as writer:
             rows: list[dict[str, Any]] = []
-            for recorded in material.messages([name]):
+            for recorded in source.messages([name]):
                 rows.append(row_of(recorded.message, columns))
-                done.count(material.names[name])
+                done.count(source.names[name])
                 if len(rows) == ROWS:
                     writer.write_table(pa.Table.from_pylist(rows, schema))
                     rows = []
@@ -113,15 +113,15 @@ def _types(pa: Any, kind: type[Message], columns: Mapping[str, list[str]]) -> It
                 yield column, plain[field.kind]
 
 
-def _tables(material: Material, done: Exported) -> Iterator[tuple[str, dict[str, list[str]]]]:
+def _tables(source: ExportSource, done: Exported) -> Iterator[tuple[str, dict[str, list[str]]]]:
     """The streams that have columns; notes what is left out."""
-    for topic in material.untouched:
+    for topic in source.untouched:
         done.left_out[topic.name] = f"{topic.encoding} messages of {topic.schema.name or 'no schema'}"
-    for name, info in material.streams.items():
+    for name, info in source.streams.items():
         assert info.message_type is not None
         columns, left_out = columns_of(info.message_type)
         if left_out:
-            done.left_out[f"{material.names[name]}: {', '.join(left_out)}"] = "arrays of no fixed, small shape"
+            done.left_out[f"{source.names[name]}: {', '.join(left_out)}"] = "arrays of no fixed, small shape"
         if columns:
             yield name, columns
 

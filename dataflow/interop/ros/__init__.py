@@ -7,6 +7,7 @@ from typing import Any
 
 import dataflow.messages as messages
 from dataflow.interop.ros import clouds, images, objects, poses, sensors
+from dataflow.interop.ros.values import covariance, vector
 
 Convert = Callable[[Any, int], messages.Message]
 """(the ROS message, its stamp in ns) → message; raises `RecordingError` and `MessageError`."""
@@ -26,7 +27,15 @@ CONVERSIONS: dict[str, tuple[type[messages.Message], Convert]] = {
     "sensor_msgs/msg/Imu": (messages.Imu, sensors.imu),
     "sensor_msgs/msg/LaserScan": (messages.LaserScan, sensors.laser_scan),
     "sensor_msgs/msg/NavSatFix": (messages.NavSatFix, sensors.nav_sat_fix),
-    "sensor_msgs/msg/MagneticField": (messages.MagneticField, sensors.magnetic_field),
+    "sensor_msgs/msg/MagneticField": (
+        messages.MagneticField,
+        lambda m, stamp: messages.MagneticField(
+            stamp=stamp,
+            frame=m.header.frame_id,
+            field=vector(m.magnetic_field),
+            covariance=covariance(m, "magnetic_field_covariance", 3),
+        ),
+    ),
     "sensor_msgs/msg/JointState": (messages.JointState, sensors.joint_state),
     "nav_msgs/msg/Odometry": (messages.Odometry, poses.odometry),
     "nav_msgs/msg/Path": (messages.Path, poses.path),
@@ -51,8 +60,8 @@ CONVERSIONS: dict[str, tuple[type[messages.Message], Convert]] = {
     "diagnostic_msgs/msg/DiagnosticArray": (messages.Diagnostics, sensors.diagnostics),
     "rcl_interfaces/msg/Log": (messages.Alarm, sensors.log),
     "rosgraph_msgs/msg/Log": (messages.Alarm, sensors.log),
-    "std_msgs/msg/String": (messages.Text, sensors.text),
-    "std_msgs/msg/Bool": (messages.Switch, sensors.switch),
+    "std_msgs/msg/String": (messages.Text, lambda m, stamp: messages.Text(stamp=stamp, text=m.data)),
+    "std_msgs/msg/Bool": (messages.Switch, lambda m, stamp: messages.Switch(stamp=stamp, on=bool(m.data))),
     **{f"std_msgs/msg/{name}": (messages.Number, sensors.number) for name in _NUMBERS},
     **{f"sensor_msgs/msg/{name}": (messages.Measurement, sensors.measurement) for name in _READINGS},
     "sensor_msgs/msg/Range": (messages.RangeReading, sensors.range_reading),

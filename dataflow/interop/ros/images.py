@@ -57,12 +57,7 @@ def image(message: Any, stamp: int) -> Raw:
         lose(message, f"a step of {step:,}, where rows have {used:,} bytes")
         step = 0
     rows = stored_rows(
-        message.encoding,
-        message.width,
-        message.height,
-        step,
-        message.data,
-        big_endian=bool(message.is_bigendian),
+        message.encoding, message.width, message.height, step, message.data, big_endian=bool(message.is_bigendian)
     )
     frame = message.header.frame_id
     rest = len(message.data) - height * (step or rows[0].nbytes)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.ros.values import orientation, time_ns, vector
+from dataflow.interop.ros.values import orientation, vector
 from dataflow.interop.seen import lose
 from dataflow.messages import Boxes3D, Detections2D, Path
 from dataflow.recording.errors import RecordingError
@@ -84,11 +84,6 @@ def marker_array(message: Any, stamp: int) -> Boxes3D:
     if others := sorted({m.type for m in message.markers if m.type not in (CUBE, CUBE_LIST)}):
         lose(message, f"markers of the types {', '.join(map(str, others))}")
     return _boxes([m for m in message.markers if m.type in (CUBE, CUBE_LIST) and m.action not in DELETE], stamp)
-
-
-def array_stamp(message: Any) -> int | None:
-    """The stamp of a MarkerArray, which is that of its first marker."""
-    return time_ns(message.markers[0].header.stamp) if message.markers else None
 
 
 def _boxes(markers: Sequence[Any], stamp: int) -> Boxes3D:

@@ -33,6 +33,7 @@ _FIX = {"no_fix": -1, "fix": 0, "sbas": 1, "gbas": 2, "rtk_float": 2, "rtk_fixed
 _ABSENT = np.array([-1.0, 0, 0, 0, 0, 0, 0, 0, 0])
 _FLOAT32, _FLOAT64, _UINT16, _UINT32 = 7, 8, 4, 6
 _LOG = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
+_NOT_OF_CODE = {"file": "", "function": "", "line": 0}
 
 
 def outward(*kinds: type[messages.Message]) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
@@ -76,17 +77,6 @@ def compressed(m: messages.CompressedImage | messages.CompressedDepth) -> Any:
         head = struct.pack("<iff", 0, m.scale if inverse else 0.0, m.offset if inverse else 0.0)
         data = np.concatenate([np.frombuffer(head, np.uint8), m.data])
     return stamped("sensor_msgs/CompressedImage", m, format=format_, data=as_bytes(data))
-
-
-@outward(messages.CompressedVideo)
-def compressed_video(m: messages.CompressedVideo) -> Any:
-    return make(
-        "foxglove_msgs/CompressedVideo",
-        timestamp=time(m.stamp),
-        frame_id=m.frame,
-        data=as_bytes(m.data),
-        format=m.format,
-    )
 
 
 @outward(messages.CameraInfo)
@@ -145,31 +135,6 @@ def point_cloud(m: messages.PointCloud) -> Any:
     )
 
 
-@outward(messages.Imu)
-def imu(m: messages.Imu) -> Any:
-    unknown = _ABSENT if m.orientation is None else matrix(m.orientation_covariance, 3)
-    return stamped(
-        "sensor_msgs/Imu",
-        m,
-        orientation=quaternion(m.orientation),
-        orientation_covariance=unknown,
-        angular_velocity=vector(m.angular_velocity),
-        angular_velocity_covariance=matrix(m.angular_velocity_covariance, 3),
-        linear_acceleration=vector(m.linear_acceleration),
-        linear_acceleration_covariance=matrix(m.linear_acceleration_covariance, 3),
-    )
-
-
-@outward(messages.MagneticField)
-def magnetic_field(m: messages.MagneticField) -> Any:
-    return stamped(
-        "sensor_msgs/MagneticField",
-        m,
-        magnetic_field=vector(m.field),
-        magnetic_field_covariance=matrix(m.covariance, 3),
-    )
-
-
 @outward(messages.LaserScan)
 def laser_scan(m: messages.LaserScan) -> Any:
     offsets = m.time_offsets
@@ -207,19 +172,6 @@ def measurement(m: messages.Measurement) -> Any:
     return stamped(f"sensor_msgs/{kind}", m, **values)
 
 
-@outward(messages.RangeReading)
-def range_reading(m: messages.RangeReading) -> Any:
-    return stamped(
-        "sensor_msgs/Range",
-        m,
-        radiation_type=int(m.radiation == "infrared"),
-        field_of_view=m.field_of_view,
-        min_range=m.range_min,
-        max_range=m.range_max,
-        range=m.range,
-    )
-
-
 @outward(messages.NavSatFix)
 def nav_sat_fix(m: messages.NavSatFix) -> Any:
     return stamped(
@@ -239,45 +191,9 @@ def joint_state(m: messages.JointState) -> Any:
     position, velocity, effort = (
         np.zeros(0) if v is None else np.array(v) for v in (m.positions, m.velocities, m.efforts)
     )
-    header = header_of(m.stamp, "")
+    header, names = header_of(m.stamp, ""), list(m.names)
     return make(
-        "sensor_msgs/JointState",
-        header=header,
-        name=list(m.names),
-        position=position,
-        velocity=velocity,
-        effort=effort,
-    )
-
-
-@outward(messages.Odometry)
-def odometry(m: messages.Odometry) -> Any:
-    return stamped(
-        "nav_msgs/Odometry",
-        m,
-        child_frame_id=m.child_frame,
-        pose=with_covariance(m.position, m.orientation, m.pose_covariance),
-        twist=moving(m.linear, m.angular, m.twist_covariance),
-    )
-
-
-@outward(messages.Point)
-def point_stamped(m: messages.Point) -> Any:
-    return stamped("geometry_msgs/PointStamped", m, point=point(m.position))
-
-
-@outward(messages.Pose)
-def pose(m: messages.Pose) -> Any:
-    placed = with_covariance(m.position, m.orientation, m.covariance)
-    return stamped("geometry_msgs/PoseWithCovarianceStamped", m, pose=placed)
-
-
-@outward(messages.Twist)
-def twist(m: messages.Twist) -> Any:
-    return stamped(
-        "geometry_msgs/TwistWithCovarianceStamped",
-        m,
-        twist=moving(m.linear, m.angular, m.covariance),
+        "sensor_msgs/JointState", header=header, name=names, position=position, velocity=velocity, effort=effort
     )
 
 
@@ -387,30 +303,57 @@ def diagnostics(m: messages.Diagnostics) -> Any:
     return make("diagnostic_msgs/DiagnosticArray", header=header_of(m.stamp, ""), status=rows)
 
 
-@outward(messages.Alarm)
-def alarm(m: messages.Alarm) -> Any:
-    return make(
-        "rcl_interfaces/Log",
-        stamp=time(m.stamp),
-        level=_LOG[m.level],
-        name=m.name,
-        msg=m.text,
-        file="",
-        function="",
-        line=0,
-    )
-
-
-@outward(messages.Number)
-def number(m: messages.Number) -> Any:
-    return make("std_msgs/Float64", data=m.value)
-
-
-@outward(messages.Text)
-def text(m: messages.Text) -> Any:
-    return make("std_msgs/String", data=m.text)
-
-
-@outward(messages.Switch)
-def switch(m: messages.Switch) -> Any:
-    return make("std_msgs/Bool", data=m.on)
+OUTWARD |= {
+    messages.Number: lambda m: make("std_msgs/Float64", data=m.value),
+    messages.Text: lambda m: make("std_msgs/String", data=m.text),
+    messages.Switch: lambda m: make("std_msgs/Bool", data=m.on),
+    messages.Alarm: lambda m: make(
+        "rcl_interfaces/Log", stamp=time(m.stamp), level=_LOG[m.level], name=m.name, msg=m.text, **_NOT_OF_CODE
+    ),
+    messages.CompressedVideo: lambda m: make(
+        "foxglove_msgs/CompressedVideo",
+        timestamp=time(m.stamp),
+        frame_id=m.frame,
+        data=as_bytes(m.data),
+        format=m.format,
+    ),
+    messages.Point: lambda m: stamped("geometry_msgs/PointStamped", m, point=point(m.position)),
+    messages.Pose: lambda m: stamped(
+        "geometry_msgs/PoseWithCovarianceStamped", m, pose=with_covariance(m.position, m.orientation, m.covariance)
+    ),
+    messages.Twist: lambda m: stamped(
+        "geometry_msgs/TwistWithCovarianceStamped", m, twist=moving(m.linear, m.angular, m.covariance)
+    ),
+    messages.Odometry: lambda m: stamped(
+        "nav_msgs/Odometry",
+        m,
+        child_frame_id=m.child_frame,
+        pose=with_covariance(m.position, m.orientation, m.pose_covariance),
+        twist=moving(m.linear, m.angular, m.twist_covariance),
+    ),
+    messages.Imu: lambda m: stamped(
+        "sensor_msgs/Imu",
+        m,
+        orientation=quaternion(m.orientation),
+        orientation_covariance=_ABSENT if m.orientation is None else matrix(m.orientation_covariance, 3),
+        angular_velocity=vector(m.angular_velocity),
+        angular_velocity_covariance=matrix(m.angular_velocity_covariance, 3),
+        linear_acceleration=vector(m.linear_acceleration),
+        linear_acceleration_covariance=matrix(m.linear_acceleration_covariance, 3),
+    ),
+    messages.MagneticField: lambda m: stamped(
+        "sensor_msgs/MagneticField",
+        m,
+        magnetic_field=vector(m.field),
+        magnetic_field_covariance=matrix(m.covariance, 3),
+    ),
+    messages.RangeReading: lambda m: stamped(
+        "sensor_msgs/Range",
+        m,
+        radiation_type=int(m.radiation == "infrared"),
+        field_of_view=m.field_of_view,
+        min_range=m.range_min,
+        max_range=m.range_max,
+        range=m.range,
+    ),
+}

@@ -10,11 +10,12 @@ import dataflow.messages as messages
 from dataflow.interop.ros.values import covariance, optional, orientation, variance, vector
 from dataflow.interop.seen import lose
 from dataflow.messages.poses import COVARIANCE_TYPES
+from dataflow.messages.values import ALARM_LEVELS
 from dataflow.recording.errors import RecordingError
 
 _FIX = {-1: "no_fix", 0: "fix", 1: "sbas", 2: "gbas"}
-_LEVELS = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
-"""Of rosgraph_msgs/Log; rcl_interfaces/Log has ten times as much."""
+_LEVELS = {n: name for k, name in enumerate(ALARM_LEVELS) for n in (1 << k, 10 * (k + 1))}
+"""Of rosgraph_msgs/Log, which are powers of two, and of rcl_interfaces/Log, from 10 to 50."""
 _ABSENT = -1.0
 _SLACK, _ROUNDED = 2.5, 1e-3
 """Increments, and radians, within which the last angle of a scan follows from its increment."""
@@ -37,16 +38,6 @@ def imu(message: Any, stamp: int) -> messages.Imu:
         angular_velocity_covariance=covariance(message, "angular_velocity_covariance", 3),
         linear_acceleration_covariance=covariance(message, "linear_acceleration_covariance", 3),
         orientation_covariance=covariance(message, "orientation_covariance", 3) if known else None,
-    )
-
-
-def magnetic_field(message: Any, stamp: int) -> messages.MagneticField:
-    """sensor_msgs/MagneticField."""
-    return messages.MagneticField(
-        stamp=stamp,
-        frame=message.header.frame_id,
-        field=vector(message.magnetic_field),
-        covariance=covariance(message, "magnetic_field_covariance", 3),
     )
 
 
@@ -116,11 +107,7 @@ def joint_state(message: Any, stamp: int) -> messages.JointState:
             lose(message, f"{name}, of {len(found)} joints where {len(names)} are named")
             values[name] = None
     return messages.JointState(
-        stamp=stamp,
-        names=names,
-        positions=values["position"],
-        velocities=values["velocity"],
-        efforts=values["effort"],
+        stamp=stamp, names=names, positions=values["position"], velocities=values["velocity"], efforts=values["effort"]
     )
 
 
@@ -163,13 +150,7 @@ def diagnostics(message: Any, stamp: int) -> messages.Diagnostics:
 def log(message: Any, stamp: int) -> messages.Alarm:
     """rosgraph_msgs/Log and rcl_interfaces/Log."""
     level = int(message.level)
-    return messages.Alarm(
-        stamp=stamp,
-        level=_LEVELS.get(level)
-        or {10: "debug", 20: "info", 30: "warning", 40: "error", 50: "fatal"}.get(level, "info"),
-        name=message.name,
-        text=message.msg,
-    )
+    return messages.Alarm(stamp=stamp, level=_LEVELS.get(level, "info"), name=message.name, text=message.msg)
 
 
 def number(message: Any, stamp: int, unit: str = "") -> messages.Number:
@@ -208,13 +189,3 @@ def range_reading(message: Any, stamp: int) -> messages.RangeReading:
         radiation="infrared" if int(message.radiation_type) == 1 else "ultrasound",
         variance=variance(message),
     )
-
-
-def text(message: Any, stamp: int) -> messages.Text:
-    """std_msgs/String."""
-    return messages.Text(stamp=stamp, text=message.data)
-
-
-def switch(message: Any, stamp: int) -> messages.Switch:
-    """std_msgs/Bool."""
-    return messages.Switch(stamp=stamp, on=bool(message.data))

@@ -24,10 +24,8 @@ Item = tuple[Any, ...]
 
 
 class Inbox:
-    """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own.
-
-    The thread that makes it has the turn.
-    """
+    """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own. The thread that
+    makes it has the turn."""
 
     def __init__(self, wake: int | None = None, incoming: Sequence[Incoming] = ()) -> None:
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if wake is None else wake

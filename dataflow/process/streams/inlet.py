@@ -90,10 +90,8 @@ class Inlet:
         return {stream for stream in streams if stream in self._static} - self._seen
 
     def _take_static(self, stream: str, envelope: Envelope) -> None:
-        """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.
-
-        An end whose number is 0 means that there is no message.
-        """
+        """Takes the one message of a static stream, if it has one, and its end; both come again after a restart. An end
+        whose number is 0 means that there is no message."""
         known = stream in self._seen
         ends = envelope.kind is Kind.END and (known or not envelope.seq)
         if envelope.kind is not Kind.MESSAGE and not ends:

@@ -22,10 +22,8 @@ LONGEST = 500
 
 
 class RecentFirings:
-    """A firing costs an append to a queue of bounded length; all else is done only on request.
-
-    Drops and details, which may be large, are not kept; of a failure the beginning of its text is.
-    """
+    """A firing costs an append to a queue of bounded length; all else is done only on request. Drops and details, which
+    may be large, are not kept; of a failure the beginning of its text is."""
 
     def __init__(self) -> None:
         self._kept: dict[str, deque[tuple[int, FiringRecord]]] = {}
@@ -51,10 +49,8 @@ class RecentFirings:
         return self._kept[operator]
 
     def batches(self, now: int | None = None) -> list[bytes]:
-        """Returns the firings of the last seconds that did not fail, in batches; from any thread.
-
-        `now`: wall time in ns.
-        """
+        """Returns the firings of the last seconds that did not fail, in batches; from any thread. `now`: wall time in
+        ns."""
         since = (time.time_ns() if now is None else now) - round(OVER * 1e9)
         return [
             encode_batch(part)

@@ -36,11 +36,8 @@ class Verdict:
 
 
 class StreamOrder:
-    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out.
-
-    `first` is the place that the stream begins with; None for a taker that may come late: until the first message it
-    believes any place.
-    """
+    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out. `first` is the place
+    that the stream begins with; None for a taker that may come late: until the first message it believes any place."""
 
     def __init__(self, first: Place | None = None) -> None:
         self.incarnation = 0
@@ -49,10 +46,8 @@ class StreamOrder:
         self._end: Envelope | None = None
 
     def goes_on(self, envelope: Envelope) -> bool:
-        """Takes a message that simply goes on: at the place that is due, above what was promised.
-
-        False, and nothing is taken note of, for anything else: that is for `take`.
-        """
+        """Takes a message that simply goes on: at the place that is due, above what was promised. False, and nothing is
+        taken note of, for anything else: that is for `take`."""
         if (
             envelope.kind is not _MESSAGE
             or self._end is not None

@@ -13,8 +13,6 @@ from itertools import count
 
 import xxhash
 from mcap.opcode import Opcode
-from mcap.records import Attachment as AttachmentRecord
-from mcap.records import AttachmentIndex
 
 from dataflow.recording.layout import DIGESTS, RECORDING
 from dataflow.recording.limits import MAX_CHUNK_BYTES
@@ -48,22 +46,6 @@ class Attachment:
     def key(self) -> Hashable:
         """Equal for attachments that are equal in all but their name."""
         return self.media_type, self.log_time, self.created, xxhash.xxh3_128_digest(self.data)
-
-    def record(self) -> AttachmentRecord:
-        """The record that holds it."""
-        return AttachmentRecord(self.created, self.log_time, self.name, self.media_type, self.data)
-
-    def index(self, place: Place) -> AttachmentIndex:
-        """The record of the summary that points to it."""
-        return AttachmentIndex(
-            offset=place.offset,
-            length=place.length,
-            log_time=self.log_time,
-            create_time=self.created,
-            data_size=len(self.data),
-            name=self.name,
-            media_type=self.media_type,
-        )
 
 
 def read_attachment(file: RawFile, place: Place) -> Attachment:

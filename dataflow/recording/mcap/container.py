@@ -14,9 +14,10 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 from mcap.opcode import Opcode
+from mcap.records import Attachment as AttachmentRecord
 from mcap.records import (
     AttachmentIndex,
     Channel,
@@ -30,14 +31,8 @@ from mcap.records import (
 )
 
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.limits import (
-    MAX_CHANNELS,
-    MAX_CHUNK_BYTES,
-    MAX_CHUNK_MESSAGES,
-    MAX_PARSED,
-    MAX_RECORD_BYTES,
-)
-from dataflow.recording.mcap.attachments import Attachment, Place
+from dataflow.recording.limits import MAX_CHANNELS, MAX_CHUNK_BYTES, MAX_CHUNK_MESSAGES, MAX_PARSED, MAX_RECORD_BYTES
+from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.ending import MAGIC, KeptIndexes, ending, record_bytes
 from dataflow.recording.mcap.packing import Buffer, Compression, Gathered, Packer, message_size
 from dataflow.recording.mcap.seals import sealed
@@ -82,8 +77,8 @@ class ContainerWriter:
         """Schemas, channels and metadata that go to the disk with the next chunk, or at a flush."""
         self._lasting = 0, 0, 0
         """Numbers of schemas, channels and metadata in the file."""
-        self._records: Gathered | None = None
-        self._messages: Gathered | None = None
+        self._open: dict[Literal["record", "message"], Gathered] = {}
+        """The chunks in progress."""
         self.first_time: int | None = None
         self.last_time = 0
         self._failure: str | None = None
@@ -152,48 +147,56 @@ class ContainerWriter:
     def add_attachment(self, attachment: Attachment) -> None:
         """Adds a file inside this one; its record has a separate checksum."""
         self._count_parsed()
-        record = record_bytes(attachment.record())
+        made = AttachmentRecord(
+            attachment.created, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+        )
+        record = record_bytes(made)
         if len(record) > MAX_CHUNK_BYTES:
             self._refuse(f"attachment {attachment.name!r}", len(record), MAX_CHUNK_BYTES)
-        place = Place(self._position + self._declared_bytes, len(record))
+        offset = self._position + self._declared_bytes
         self._append(record)
-        self._attachments.append(attachment.index(place))
+        self._attachments.append(
+            AttachmentIndex(
+                offset=offset,
+                length=len(record),
+                log_time=made.log_time,
+                create_time=made.create_time,
+                data_size=len(made.data),
+                name=made.name,
+                media_type=made.media_type,
+            )
+        )
 
     def add_messages(self, group: Sequence[tuple[int, int, int, Sequence[Buffer]]]) -> None:
         """Adds messages, each (channel, log time, sequence, parts of its data), that must not be torn apart.
 
         Raises `RecordingError` for a group larger than a chunk that readers take.
         """
-        size = sum(message_size(parts) for _, _, _, parts in group)
-        if size > MAX_CHUNK_BYTES:
-            self._refuse("a message", size, MAX_CHUNK_BYTES)
-        now = self._begin(0 if self._messages is None else self._messages.size + size)
-        chunk = self._messages = self._messages or Gathered(now)
-        for channel, log_time, sequence, parts in group:
-            chunk.add(channel, log_time, sequence, parts)
-        self._finish_if_full(chunk)
+        self._gather("message", group)
 
     def add_record(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
         """Adds a record of the run, which lies apart from the messages of streams."""
-        size = message_size([data])
-        if size > MAX_CHUNK_BYTES:
-            self._refuse("a record", size, MAX_CHUNK_BYTES)
-        now = self._begin(0 if self._records is None else self._records.size + size)
-        chunk = self._records = self._records or Gathered(now)
-        chunk.add(channel, log_time, sequence, [data])
-        self._finish_if_full(chunk)
+        self._gather("record", [(channel, log_time, sequence, [data])])
 
     def add_copied(self, channel: int, log_time: int, publish_time: int, sequence: int, data: Buffer) -> None:
         """Adds a message of another file as it is there."""
-        size = message_size([data])
-        if size > MAX_CHUNK_BYTES:
-            self._refuse("a message", size, MAX_CHUNK_BYTES)
-        now = self._begin(0 if self._messages is None else self._messages.size + size)
-        chunk = self._messages = self._messages or Gathered(now)
-        chunk.add(channel, log_time, sequence, [data], publish_time)
-        self._finish_if_full(chunk)
+        self._gather("message", [(channel, log_time, sequence, [data])], publish_time)
 
-    def _finish_if_full(self, chunk: Gathered) -> None:
+    def _gather(
+        self,
+        kind: Literal["record", "message"],
+        group: Sequence[tuple[int, int, int, Sequence[Buffer]]],
+        published: int | None = None,
+    ) -> None:
+        size = sum(message_size(parts) for _, _, _, parts in group)
+        if size > MAX_CHUNK_BYTES:
+            self._refuse(f"a {kind}", size, MAX_CHUNK_BYTES)
+        now = self._begin(self._open[kind].size + size if kind in self._open else 0)
+        chunk = self._open.get(kind)
+        if chunk is None:
+            chunk = self._open[kind] = Gathered(now)
+        for channel, log_time, sequence, parts in group:
+            chunk.add(channel, log_time, sequence, parts, published)
         if chunk.size >= self._chunk_bytes or chunk.messages >= MAX_CHUNK_MESSAGES:
             self.finish_chunks()
 
@@ -243,11 +246,11 @@ class ContainerWriter:
             self.last_time = max(self.last_time, chunk.last)
             for channel, count in chunk.counts.items():
                 self._counts[channel] += count
-        self._records = self._messages = None
+        self._open.clear()
 
     def _gathered(self) -> list[Gathered]:
         """The chunks in progress, in the order in which they are written."""
-        return [chunk for chunk in (self._records, self._messages) if chunk is not None]
+        return [self._open[kind] for kind in ("record", "message") if kind in self._open]
 
     def _unsaved(self) -> int:
         """Messages and records in chunks in progress."""
@@ -262,17 +265,13 @@ class ContainerWriter:
                 self.finish_chunks()
                 self._write(self._ending())
             else:
-                self._close_after_failure()
+                failure, self._failure = self._failure, None
+                with contextlib.suppress(RecordingError):  # without an index, readers make one by a pass over the file
+                    self._write(self._ending())
+                self._failure = failure
         finally:
             os.close(self._fd)
             self._fd = -1
-
-    def _close_after_failure(self) -> None:
-        """The end of a file whose last write failed: an index over what is there, if it fits."""
-        failure, self._failure = self._failure, None
-        with contextlib.suppress(RecordingError):  # without one, readers index the file by a pass over it
-            self._write(self._ending())
-        self._failure = failure
 
     def _check_usable(self) -> None:
         if self._failure is not None:

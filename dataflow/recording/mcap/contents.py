@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,9 +41,17 @@ class Entries:
         """Times, chunks and offsets."""
         return self.times, self.chunks, self.offsets
 
+    @classmethod
+    def joined(cls, parts: Iterable[Entries]) -> Entries:
+        """Parts one behind the other."""
+        return cls(*map(np.concatenate, zip(*(part.columns for part in (NO_ENTRIES, *parts)), strict=True)))
+
     def where(self, kept: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Entries:
         """Those of them that are to be kept, by a mask or by their places."""
         return Entries(self.times[kept], self.chunks[kept], self.offsets[kept])
+
+
+NO_ENTRIES = Entries(*(np.empty(0, np.int64) for _ in range(3)))
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from dataflow.recording.mcap.chunk_indexes import ChunkIndexes, gathered
 from dataflow.recording.mcap.chunks import Chunks, Column
-from dataflow.recording.mcap.contents import Contents, Entries
+from dataflow.recording.mcap.contents import NO_ENTRIES, Contents, Entries
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
 from dataflow.recording.mcap.seals import Seal, seal_of
 
@@ -30,7 +30,6 @@ SAMPLED_BYTES = 2**23
 
 _HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("nbytes", "<u4")])
 _ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
-_NONE = Entries(*(np.empty(0, np.int64) for _ in range(3)))
 
 
 class MessageIndex(Protocol):
@@ -74,7 +73,7 @@ class LoadedIndex:
         return (int(times.min()), int(times.max())) if len(times) else None
 
     def entries(self, channel: int) -> Entries:
-        return self._entries.get(channel, _NONE)
+        return self._entries.get(channel, NO_ENTRIES)
 
     def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
         yield self.entries(channel)
@@ -139,20 +138,21 @@ class LongIndex:
         return least
 
     def entries(self, channel: int) -> Entries:
-        return self._all.get(channel, _NONE)
+        return self._all.get(channel, NO_ENTRIES)
 
     @cached_property
     def _all(self) -> Mapping[int, Entries]:
         return self._load(np.arange(len(self._indexes)), np.unique(self._indexes.channels).tolist())
 
     def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
-        firsts, held = self._indexes.firsts, _NONE
+        firsts, held = self._indexes.firsts, NO_ENTRIES
         for numbers in self._by_time(channel, start, end):
             before = held.times < firsts[numbers[0]]
             if before.any():
                 yield held.where(before)
                 held = held.where(~before)
-            held = _joined(held, self._load(numbers, [channel])[channel])
+            loaded = self._load(numbers, [channel])[channel]
+            held = Entries.joined((held, loaded)) if len(held) else loaded
         yield held
 
     def _by_time(self, channel: int, start: int | None, end: int | None) -> Iterator[Column]:
@@ -198,7 +198,7 @@ class LongIndex:
         take_messages(found, self._indexes, numbers, sealed=self._sealed, wanted=wanted)
         self._damage += [note for note in found.damage if note not in self._damage]
         loaded = found.entries()
-        return {channel: loaded.get(channel, _NONE) for channel in channels}
+        return {channel: loaded.get(channel, NO_ENTRIES) for channel in channels}
 
 
 def steps(indexes: ChunkIndexes, numbers: Column) -> Iterator[Column]:
@@ -317,9 +317,3 @@ def _message_indexes(
             bodies.append(data[position + RECORD.size : end])
         position = end
     return bodies if position == len(data) and sorted(found) == sorted(indexes.channels_of(number)) else None
-
-
-def _joined(a: Entries, b: Entries) -> Entries:
-    if not len(a):
-        return b
-    return Entries(*(np.concatenate(pair) for pair in zip(a.columns, b.columns, strict=True)))

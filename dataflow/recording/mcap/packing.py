@@ -25,7 +25,6 @@ Buffer = bytes | memoryview
 
 ZSTD_LEVEL = 1
 _MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_FIXED = _MESSAGE.size - 9
 _INDEX = struct.Struct("<BQHI")
 _CHUNK = struct.Struct("<BQQQQI")
 

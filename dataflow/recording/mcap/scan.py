@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from mcap.opcode import Opcode
 
 from dataflow.recording.errors import DamagedError
@@ -14,14 +12,6 @@ from dataflow.recording.mcap.contents import MESSAGE_BODY, Contents
 from dataflow.recording.mcap.ending import MAGIC
 from dataflow.recording.mcap.rawfile import RECORD, RawFile
 from dataflow.recording.mcap.seals import Seal, seal_of
-
-
-@dataclass(slots=True)
-class _Pending:
-    """A chunk whose message indexes are being read."""
-
-    number: int
-    indexes: list[bytes] = field(default_factory=list)
 
 
 class Scan:
@@ -41,7 +31,9 @@ class Scan:
         self._file = file
         self._in_vain = 0
         self._sealed, self._trusting, self._lenient = sealed, trusting, lenient
-        self._pending: _Pending | None = None
+        self._pending: int | None = None
+        """The chunk whose message indexes, `_indexes`, are being read."""
+        self._indexes: list[bytes] = []
 
     def run(self) -> None:
         file = self._file
@@ -63,7 +55,7 @@ class Scan:
         if opcode == Opcode.MESSAGE_INDEX and self._pending is not None:
             body = self._body(at, length)
             if body is not None:
-                self._pending.indexes.append(body)
+                self._indexes.append(body)
             return
         self._settle()
         match opcode:
@@ -72,7 +64,7 @@ class Scan:
                     raise self._file.damaged(f"the chunk at byte {at} is too short")
                 head = self._file.near(at + RECORD.size, CHUNK_HEAD)
                 ref = ChunkRef(at + RECORD.size, length, size_in_head(head))
-                self._pending = _Pending(self.contents.chunks.add(ref))
+                self._pending, self._indexes = self.contents.chunks.add(ref), []
             case Opcode.SCHEMA | Opcode.CHANNEL:
                 body = self._body(at, length)
                 if body is not None:
@@ -124,20 +116,20 @@ class Scan:
         if pending is None:
             return
         contents = self.contents
-        known = all(int.from_bytes(body[:2], "little") in contents.channels for body in pending.indexes)
-        if self._trusting and not torn and pending.indexes and known:
-            if contents.add_indexes(pending.number, pending.indexes):
+        known = all(int.from_bytes(body[:2], "little") in contents.channels for body in self._indexes)
+        if self._trusting and not torn and self._indexes and known:
+            if contents.add_indexes(pending, self._indexes):
                 self.believed = True
                 return
-            contents.damage.append(f"a message index of {contents.chunks.where(pending.number)} is damaged")
+            contents.damage.append(f"a message index of {contents.chunks.where(pending)} is damaged")
         if not self._sealed:  # what our writer writes expands as it may: a damaged recording can be read whole
-            contents.chunks.check_ratio(pending.number)
+            contents.chunks.check_ratio(pending)
         try:
-            contents.take_chunk(pending.number)
+            contents.take_chunk(pending)
         except DamagedError as error:
             if not self._lenient:
                 raise
-            ref = contents.chunks.ref(pending.number)
+            ref = contents.chunks.ref(pending)
             self._in_vain += ref.uncompressed_size - LIKELY_RATIO * ref.length
             if self._in_vain > MAX_IN_VAIN:
                 raise

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.recording.streams.entries import Recorded
 from dataflow.recording.streams.json_columns import Values
 from dataflow.recording.streams.ordering import Row
 
-T = TypeVar("T")
 BATCH = 128
 """Messages that are decoded together; what they hold besides the fields asked for is in memory meanwhile."""
 _WIDTH = 8
 _KEY, _LOG_TIME = 0, 4
 
 
-class StreamIndex(Generic[T]):
+class StreamIndex:
     """The messages of one stream by their place in it, from 0; 64 bytes of memory a message until one is read.
 
     `stamps`: (N,) nanoseconds since the epoch, in stream order.
@@ -28,7 +28,7 @@ class StreamIndex(Generic[T]):
     def __init__(
         self,
         rows: Iterable[Row],
-        read: Callable[[Row], T],
+        read: Callable[[Row], Recorded],
         columns: Callable[[Sequence[Row], Collection[str]], Mapping[str, Values]],
         *,
         stamped_by_log_time: bool,
@@ -40,7 +40,7 @@ class StreamIndex(Generic[T]):
     def __len__(self) -> int:
         return len(self._rows)
 
-    def read(self, place: int) -> T:
+    def read(self, place: int) -> Recorded:
         """The message at a place, decoded now. Raises `RecordingError`."""
         return self._read(tuple(self._rows[place].tolist()))
 

@@ -46,8 +46,10 @@ class Codec(Protocol):
     @property
     def message_encoding(self) -> str: ...
 
+    @property
     def schema(self) -> SchemaText: ...
 
+    @property
     def companion_schema(self) -> SchemaText | None:
         """The schema of the companion, where the type may need one."""
 
@@ -71,20 +73,15 @@ class JsonCodec(Generic[M]):
     """Any message type as JSON."""
 
     message_encoding = "json"
+    companion_schema = None
 
     def __init__(self, message: type[M]) -> None:
         self._message = message
 
-    def schema(self) -> SchemaText:
-        return self._schema
-
     @cached_property
-    def _schema(self) -> SchemaText:
+    def schema(self) -> SchemaText:
         message = self._message
         return SchemaText(f"dataflow.{message.SCHEMA}", "jsonschema", json_schema(message, message.FIELDS))
-
-    def companion_schema(self) -> SchemaText | None:
-        return None
 
     def encode(self, message: M) -> tuple[Parts, bytes | None]:
         fields = encode_fields(message, self._message.FIELDS)
@@ -107,23 +104,23 @@ class FoxgloveCodec(Generic[M]):
     message_encoding = "protobuf"
 
     def __init__(self, message: type[M], schema: FoxgloveSchema) -> None:
-        self._message, self._schema = message, schema
+        self._message, self._mapping = message, schema
         self._fields = {f.name: f for f in message.FIELDS}
         self._companion: tuple[Field, ...] = tuple(self._fields[name] for name in schema.companion)
 
+    @cached_property
     def schema(self) -> SchemaText:
-        return SchemaText(self._schema.name, "protobuf", file_descriptor_set(self._schema.proto))
-
-    def companion_schema(self) -> SchemaText | None:
-        return self._companion_schema if self._companion else None
+        return SchemaText(self._mapping.name, "protobuf", file_descriptor_set(self._mapping.proto))
 
     @cached_property
-    def _companion_schema(self) -> SchemaText:
-        data = json_schema(self._message, self._companion, companion_of=self._schema.name)
+    def companion_schema(self) -> SchemaText | None:
+        if not self._companion:
+            return None
+        data = json_schema(self._message, self._companion, companion_of=self._mapping.name)
         return SchemaText(f"dataflow.{self._message.SCHEMA}.companion", "jsonschema", data)
 
     def encode(self, message: M) -> tuple[Parts, bytes | None]:
-        parts, lacks = self._schema.encode(message)
+        parts, lacks = self._mapping.encode(message)
         if not lacks:
             return parts, None
         companion: dict[str, Any] = {TIMESTAMP: timestamp_object(message.stamp)}
@@ -145,7 +142,7 @@ class FoxgloveCodec(Generic[M]):
         return {name: [fields.get(name) for fields in found] for name in names}
 
     def _decoded(self, data: Any, companion: Any | None) -> dict[str, Any]:
-        fields = self._schema.decode(self._schema.parse(data))
+        fields = self._mapping.decode(self._mapping.parse(data))
         if companion is not None:
             extra = decode_object(companion)
             fields |= decode_fields(extra, self._companion)

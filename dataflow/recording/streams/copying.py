@@ -15,17 +15,16 @@ from mcap.records import Channel
 
 from dataflow.messages import Odometry, Transforms
 from dataflow.recording.errors import DamagedError, RecordingError
-from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
+from dataflow.recording.layout import RECORDING, Kind, firings_topic
 from dataflow.recording.mcap.container import ContainerWriter
 from dataflow.recording.mcap.contents import Entries
 from dataflow.recording.mcap.index import McapFile, RawMessage
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.parts import OWNER_ONLY
-from dataflow.recording.streams.codecs import codec_for
 from dataflow.recording.streams.entries import Recorded
-from dataflow.recording.streams.frames import FrameTree
+from dataflow.recording.streams.frames import FrameChannel
 from dataflow.recording.streams.ordering import in_file_order
-from dataflow.recording.streams.reader import Recording
+from dataflow.recording.streams.reader import Recording, merged_metadata
 
 Mask = npt.NDArray[np.bool_]
 RUN_KINDS = (Kind.FIRINGS, Kind.EVENTS, Kind.LOGS)
@@ -36,7 +35,7 @@ TIMES = 2**64
 
 
 class Origin:
-    """An MCAP file as material: a context manager.
+    """An MCAP file to copy from: a context manager.
 
     `lenient`: what cannot be read is left out, with a note in `file.damage`. `own`: this program's recording;
     `namespace`: its namespace; `metadata`: of one name and key the latest counts. `lost`: of another program's file, by
@@ -46,9 +45,7 @@ class Origin:
     def __init__(self, path: Path, *, lenient: bool = False) -> None:
         self.path = path
         self.file = McapFile(path, lenient=lenient)
-        self.metadata: dict[str, dict[str, str]] = {}
-        for name, mapping in self.file.metadata:
-            self.metadata.setdefault(name, {}).update(mapping)
+        self.metadata = merged_metadata(self.file.metadata)
         self.own = RECORDING in self.metadata
         self.lost: dict[str, int] = {}
         self.reasons: dict[str, str] = {}
@@ -150,7 +147,6 @@ class Copy:
         )
         self._channels: dict[tuple[int, int], int] = {}
         self._alike: dict[tuple[object, ...], list[tuple[int, int]]] = {}
-        self._frames: tuple[int, int] | None = None
         self.attached = 0
 
     def channel(self, origin: Origin, channel: int, topic: str | None = None) -> int:
@@ -199,18 +195,10 @@ class Copy:
 
     def frames(self, namespace: str, messages: Iterator[Recorded]) -> None:
         """Derives the frame tree for other viewers from the kept messages, as a recorder does."""
-        tree, codec = FrameTree(), codec_for(Transforms)
+        channel = FrameChannel(self.writer, namespace)
         for found in messages:
-            for transforms in tree.transforms(found.stream, found.message):
-                if self._frames is None:
-                    text = codec.schema()
-                    schema = self.writer.add_schema(text.name, text.encoding, text.data)
-                    topic, kind = frames_topic(namespace), {"kind": str(Kind.FRAMES)}
-                    self._frames = (self.writer.add_channel(topic, codec.message_encoding, schema, kind), 0)
-                channel, count = self._frames
-                parts, _ = codec.encode(transforms)
-                self.writer.add_messages([(channel, found.stamp, count, list(parts))])
-                self._frames = channel, count + 1
+            if derived := channel.derived(found.stream, found.message):
+                self.writer.add_messages(derived)
 
     def __enter__(self) -> Self:
         return self
@@ -239,10 +227,7 @@ def places(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[RawMessage]:
 
     Of another program's file, those that damage keeps from being read are left out, and counted there.
     """
-    chosen: list[tuple[int, Entries]] = []
-    for channel, mask in kept.items():
-        chosen.append((channel, origin.entries(channel).where(mask)))
-    for place in in_file_order(chosen):
+    for place in in_file_order([(channel, origin.entries(channel).where(mask)) for channel, mask in kept.items()]):
         try:
             raw = origin.file.read(*place)
         except DamagedError as error:

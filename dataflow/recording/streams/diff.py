@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -90,10 +90,7 @@ class DiffReport:
         """The report as JSON values; an infinite difference is the string "Infinity"."""
         streams = [
             asdict(s)
-            | {
-                "max_difference": _plain(s.max_difference),
-                "first": None if s.first is None else s.first.as_json(),
-            }
+            | {"max_difference": _plain(s.max_difference), "first": None if s.first is None else s.first.as_json()}
             for s in self.streams
         ]
         return {"same": self.same, "a": self.a, "b": self.b, "tolerance": self.tolerance, "streams": streams}
@@ -143,7 +140,11 @@ def diff(
 def _compare_messages(result: StreamDiff, a: Recording, b: Recording, tolerance: float | None) -> None:
     for in_a, in_b in _paired(a.messages([result.stream]), b.messages([result.stream]), _by_stamp):
         if in_a is None or in_b is None:
-            _count_missing(result, in_a, in_b)
+            there = in_a or in_b
+            assert there is not None
+            _count_missing(
+                result, in_a is None, FieldDifference(there.stamp, "(message)", f"message {there.seq}", None)
+            )
         elif in_a.message.digest() != in_b.message.digest():
             found, largest = differences(in_a.message, in_b.message, tolerance)
             result.max_difference = max(result.max_difference, largest)
@@ -179,17 +180,10 @@ def _count_unread(result: StreamDiff, a: Recording, b: Recording) -> None:
     result.unread_in_a, result.unread_in_b = (0 if unread is None else unread.count for unread in (in_a, in_b))
 
 
-def _count_missing(result: StreamDiff, in_a: Recorded | None, in_b: Recorded | None) -> None:
-    present = in_a or in_b
-    assert present is not None
-    if in_a is None:
-        result.missing_in_a += 1
-    else:
-        result.missing_in_b += 1
-    where = "B" if in_a is None else "A"
-    result.first = result.first or FieldDifference(
-        present.stamp, "(message)", f"message {present.seq} is only in {where}", None
-    )
+def _count_missing(result: StreamDiff, lacks_a: bool, present: FieldDifference) -> None:
+    result.missing_in_a += lacks_a
+    result.missing_in_b += not lacks_a
+    result.first = result.first or replace(present, detail=f"{present.detail} is only in {'B' if lacks_a else 'A'}")
 
 
 def differences(a: Message, b: Message, tolerance: float | None = None) -> tuple[list[FieldDifference], float]:
@@ -299,15 +293,11 @@ def _compare_bytes(result: StreamDiff, a: Recording, b: Recording) -> None:
     """Streams without a message type: the records of equal log time side by side."""
     pairs = _paired(a.raw([result.stream]), b.raw([result.stream]), lambda record: (record.log_time, 0))
     for number, (in_a, in_b) in enumerate(pairs):
-        present = in_a or in_b
-        assert present is not None
+        there = in_a or in_b
+        assert there is not None
         if in_a is None or in_b is None:
-            result.missing_in_a += in_a is None
-            result.missing_in_b += in_b is None
-            detail = f"message {number} is only in {'B' if in_a is None else 'A'}"
+            _count_missing(result, in_a is None, FieldDifference(there.log_time, "(bytes)", f"message {number}", None))
         elif in_a.data != in_b.data:
             result.differing += 1
             detail = f"message {number} has other bytes ({len(in_a.data)} against {len(in_b.data)})"
-        else:
-            continue
-        result.first = result.first or FieldDifference(present.log_time, "(bytes)", detail, None)
+            result.first = result.first or FieldDifference(there.log_time, "(bytes)", detail, None)

@@ -9,53 +9,25 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = (
-    "eclipse-zenoh",
-    "foxglove-schemas-protobuf",
-    "gtsam",
-    "kiss-icp",
-    "lz4",
-    "mcap",
-    "msgpack",
-    "numpy",
-    "onnxruntime",
-    "onnxruntime-gpu",
-    "open3d",
-    "opencv-python",
-    "opencv-python-headless",
-    "protobuf",
-    "robot-dataflow",
-    "scipy",
-    "small-gicp",
-    "torch",
-    "torchvision",
-    "xxhash",
-    "zstandard",
+_PACKAGES = (
+    "eclipse-zenoh foxglove-schemas-protobuf gtsam kiss-icp lz4 mcap msgpack numpy onnxruntime onnxruntime-gpu open3d "
+    "opencv-python opencv-python-headless protobuf robot-dataflow scipy small-gicp torch torchvision xxhash zstandard"
 )
+PACKAGES = tuple(_PACKAGES.split())
 """Packages whose version can change what is computed or how it is stored."""
 
-THREAD_VARIABLES = (
-    "BLIS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "PYTHONHASHSEED",
-    "TBB_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
+_THREADS = (
+    "BLIS_NUM_THREADS MKL_NUM_THREADS NUMEXPR_NUM_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS PYTHONHASHSEED "
+    "TBB_NUM_THREADS VECLIB_MAXIMUM_THREADS"
 )
+THREAD_VARIABLES = tuple(_THREADS.split())
 """Variables that fix thread counts and hash order."""
 
-KERNEL_VARIABLES = (
-    "CUBLAS_WORKSPACE_CONFIG",
-    "CUDA_VISIBLE_DEVICES",
-    "MKL_CBWR",
-    "MKL_ENABLE_INSTRUCTIONS",
-    "NPY_DISABLE_CPU_FEATURES",
-    "NVIDIA_TF32_OVERRIDE",
-    "OPENBLAS_CORETYPE",
-    "OPENCV_CPU_DISABLE",
+_KERNELS = (
+    "CUBLAS_WORKSPACE_CONFIG CUDA_VISIBLE_DEVICES MKL_CBWR MKL_ENABLE_INSTRUCTIONS NPY_DISABLE_CPU_FEATURES "
+    "NVIDIA_TF32_OVERRIDE OPENBLAS_CORETYPE OPENCV_CPU_DISABLE"
 )
+KERNEL_VARIABLES = tuple(_KERNELS.split())
 """Variables by which the numerical libraries choose other code for the same computation."""
 
 _FEATURES = (
@@ -65,15 +37,13 @@ _FEATURES = (
 CPU_FEATURES = frozenset(_FEATURES.split())
 """Instruction sets that numeric libraries choose their kernels by."""
 
-
 FACTS = frozenset(("machine", "packages", "device"))
 """Metadata records whose values may differ between machines of one run."""
-_ELSEWHERE = "dataflow:{group} of {machine}"
 
 
 def record_elsewhere(group: str, machine: str) -> str:
     """Returns the name of the metadata record with facts of another machine: "dataflow:packages of robot"."""
-    return _ELSEWHERE.format(group=group, machine=machine)
+    return f"dataflow:{group} of {machine}"
 
 
 def group_of(record: str) -> tuple[str, str]:
@@ -99,7 +69,7 @@ def machine_facts(environment: Mapping[str, str] | None = None) -> dict[str, dic
         "libc": " ".join(platform.libc_ver()).strip(),
         "os": platform.platform(),
         "python": platform.python_version(),
-        "usable_cores": str(_usable_cores()),
+        "usable_cores": str(len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 0),
     }
     return {
         "machine": dict(sorted(machine.items())),
@@ -124,12 +94,6 @@ def _cpu() -> tuple[str, frozenset[str]]:
         elif key.strip() in ("flags", "Features") and not features:
             features = frozenset(value.split())
     return model or platform.processor(), features
-
-
-def _usable_cores() -> int:
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 0
 
 
 def _packages() -> dict[str, str]:

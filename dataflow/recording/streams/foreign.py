@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -11,14 +12,13 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.json_format import ParseDict, ParseError
-from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from dataflow.messages import DepthImage, Image, Image16, Transforms
 from dataflow.messages.base import Message
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.codecs import SchemaText, build
-from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
+from dataflow.recording.streams.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, parsed, stamp_of
 from dataflow.recording.streams.foxglove.clouds import CLOUD_FIELDS
 from dataflow.recording.streams.json_codec import decode_object
 from dataflow.recording.streams.pixels import is_16_bit
@@ -56,15 +56,7 @@ def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[byte
     return None if found is None else found.bind(schema)
 
 
-def _one_transform(proto: FrameTransform, log_time: int) -> Message:
-    """foxglove.FrameTransform: a set of one."""
-    return _message(FOXGLOVE_SCHEMAS[Transforms], FrameTransforms(transforms=[proto]), log_time)
-
-
-_UNREAD: dict[str, tuple[str, ...]] = {
-    "foxglove.Log": ("file", "line"),
-    "foxglove.LocationFix": ("color",),
-}
+_UNREAD: dict[str, tuple[str, ...]] = {"foxglove.Log": ("file", "line"), "foxglove.LocationFix": ("color",)}
 """By schema, the fields that have no place here."""
 
 
@@ -73,7 +65,7 @@ def foreign_losses(message_encoding: str, schema: SchemaText, data: bytes) -> li
     found = next((s for s in FOXGLOVE_SCHEMAS.values() if s.name == schema.name), None)
     if found is None or message_encoding not in ("protobuf", "json"):
         return []
-    proto = found.parse(data) if message_encoding == "protobuf" else _from_json(found, data)
+    proto = found.parse(data) if message_encoding == "protobuf" else _from_json(found.proto, data)
     lost = [field.name for field, _ in proto.ListFields() if field.name in _UNREAD.get(schema.name, ())]
     if isinstance(proto, PointCloud):
         lost += [f"the field {field.name} of the points" for field in proto.fields if field.name not in CLOUD_FIELDS]
@@ -98,23 +90,13 @@ def _message(schema: FoxgloveSchema, proto: Any, log_time: int) -> Message:
     return build(schema.message, _stamp(proto, log_time), schema.decode(proto))
 
 
-def _protobuf(schema: FoxgloveSchema) -> ForeignDecoder:
-    return ForeignDecoder(lambda _: lambda data, log_time: _message(schema, schema.parse(data), log_time))
+def _one_transform(proto: FrameTransform, log_time: int) -> Message:
+    """foxglove.FrameTransform: a set of one."""
+    return _message(FOXGLOVE_SCHEMAS[Transforms], FrameTransforms(transforms=[proto]), log_time)
 
 
-def _json(schema: FoxgloveSchema) -> ForeignDecoder:
-    def bind(_: SchemaText) -> Callable[[bytes, int], Message]:
-        return lambda data, log_time: _message(schema, _from_json(schema, data), log_time)
-
-    return ForeignDecoder(bind)
-
-
-def _from_json(schema: FoxgloveSchema, data: bytes) -> Any:
-    return _proto_of(schema.proto(), data)
-
-
-def _proto_of(proto: Any, data: bytes) -> Any:
-    value = decode_object(data)
+def _from_json(kind: type[Any], data: bytes) -> Any:
+    value, proto = decode_object(data), kind()
     if not isinstance(value, dict):
         raise RecordingError(f"not a {proto.DESCRIPTOR.full_name}: the JSON is no object, but {type(value).__name__}")
     try:
@@ -122,13 +104,6 @@ def _proto_of(proto: Any, data: bytes) -> Any:
     except ParseError as error:
         raise RecordingError(f"not a {proto.DESCRIPTOR.full_name}: {error}") from error
     return proto
-
-
-def _parsed_transform(data: bytes) -> FrameTransform:
-    try:
-        return FrameTransform.FromString(data)
-    except DecodeError as error:
-        raise RecordingError(f"not a foxglove.FrameTransform: {error}") from error
 
 
 def _with_proto_times(value: Any) -> Any:
@@ -149,17 +124,24 @@ def _rfc3339(seconds: Any, nanoseconds: Any) -> str:
         raise RecordingError(f"time {seconds!r} s {nanoseconds!r} ns: {error}") from error
 
 
+def _register(name: str, kind: type[Any], message: Callable[[Any, int], Message]) -> None:
+    """Registers the decoders of a protobuf, as such and as JSON."""
+    for encoding, parse in (("protobuf", parsed), ("json", _from_json)):
+        decode = partial(_decoded, parse, kind, message)
+        register_decoder(encoding, name, ForeignDecoder(lambda _, decode=decode: decode))  # type: ignore[misc]
+
+
+def _decoded(
+    parse: Callable[[type[Any], bytes], Any],
+    kind: type[Any],
+    message: Callable[[Any, int], Message],
+    data: bytes,
+    log_time: int,
+) -> Message:
+    return message(parse(kind, data), log_time)
+
+
 for _schema in FOXGLOVE_SCHEMAS.values():
     if _PREFERRED.get(_schema.name, _schema.message.SCHEMA) == _schema.message.SCHEMA:
-        register_decoder("protobuf", _schema.name, _protobuf(_schema))
-        register_decoder("json", _schema.name, _json(_schema))
-register_decoder(
-    "protobuf",
-    "foxglove.FrameTransform",
-    ForeignDecoder(lambda _: lambda data, log_time: _one_transform(_parsed_transform(data), log_time)),
-)
-register_decoder(
-    "json",
-    "foxglove.FrameTransform",
-    ForeignDecoder(lambda _: lambda data, log_time: _one_transform(_proto_of(FrameTransform(), data), log_time)),
-)
+        _register(_schema.name, _schema.proto, partial(_message, _schema))
+_register("foxglove.FrameTransform", FrameTransform, _one_transform)

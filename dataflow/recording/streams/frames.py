@@ -7,11 +7,13 @@ is derived from them. Our own reader leaves it out: it holds nothing that the st
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from dataflow.messages import Message, Odometry, Transforms
+from dataflow.recording.layout import SEQUENCE_SPAN, Kind, frames_topic
+from dataflow.recording.mcap.container import ContainerWriter
+from dataflow.recording.streams.codecs import codec_for
+from dataflow.recording.streams.foxglove import Parts
 
 VIEWER_ROOT = "tf#/"
 """The name that Rerun's importer gives the frame of its root."""
@@ -24,38 +26,49 @@ class FrameTree:
         self._placed_by: dict[str, str] = {}
         self._roots: set[str] = set()
 
-    def transforms(self, stream: str, message: Message) -> Iterator[Transforms]:
+    def transforms(self, stream: str, message: Message) -> Transforms | None:
         """The transforms to write beside `message`: its own when it is the first stream to place that frame, and the
         link from the viewer's root to a frame that nothing places."""
-        if isinstance(message, Odometry):
-            places_one = message.child_frame not in ("", message.frame)
-            if places_one and self._placed_by.setdefault(message.child_frame, stream) == stream:
-                link = self._root(message.frame)
-                own = Transforms(
-                    stamp=message.stamp,
-                    frames=(message.frame,),
-                    child_frames=(message.child_frame,),
-                    translations=message.position[np.newaxis],
-                    rotations=message.orientation[np.newaxis],
-                )
-                yield own if link is None else _joined(own, link)
-        elif isinstance(message, Transforms):
+        if isinstance(message, Transforms):
             for child in message.child_frames:
                 self._placed_by.setdefault(child, stream)
-
-    def _root(self, frame: str) -> str | None:
-        """`frame` when it has to be linked to the viewer's root now."""
-        if frame in self._placed_by or frame in self._roots:
+        if not isinstance(message, Odometry) or message.child_frame in ("", message.frame):
             return None
-        self._roots.add(frame)
-        return frame
+        if self._placed_by.setdefault(message.child_frame, stream) != stream:
+            return None
+        rows = [(message.frame, message.child_frame, message.position, message.orientation)]
+        if message.frame not in self._placed_by and message.frame not in self._roots:
+            self._roots.add(message.frame)
+            rows.append((VIEWER_ROOT, message.frame, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
+        frames, child_frames, translations, rotations = zip(*rows, strict=True)
+        return Transforms(
+            stamp=message.stamp,
+            frames=frames,
+            child_frames=child_frames,
+            translations=np.array(translations),
+            rotations=np.array(rotations),
+        )
 
 
-def _joined(own: Transforms, root: str) -> Transforms:
-    return Transforms(
-        stamp=own.stamp,
-        frames=(*own.frames, VIEWER_ROOT),
-        child_frames=(*own.child_frames, root),
-        translations=np.vstack([own.translations, [0.0, 0.0, 0.0]]),
-        rotations=np.vstack([own.rotations, [0.0, 0.0, 0.0, 1.0]]),
-    )
+class FrameChannel:
+    """The channel of derived transforms in a file, which is declared with the first of them."""
+
+    def __init__(self, file: ContainerWriter, namespace: str) -> None:
+        self._file, self._namespace = file, namespace
+        self._tree, self._codec = FrameTree(), codec_for(Transforms)
+        self._channel = self._count = 0
+
+    def derived(self, stream: str, message: Message) -> list[tuple[int, int, int, Parts]]:
+        """The transforms that a message implies, as `ContainerWriter.add_messages` takes them."""
+        transforms = self._tree.transforms(stream, message)
+        if transforms is None:
+            return []
+        if not self._channel:
+            text, encoding = self._codec.schema, self._codec.message_encoding
+            schema = self._file.add_schema(text.name, text.encoding, text.data)
+            self._channel = self._file.add_channel(
+                frames_topic(self._namespace), encoding, schema, {"kind": str(Kind.FRAMES)}
+            )
+        self._count += 1
+        parts, _ = self._codec.encode(transforms)
+        return [(self._channel, message.stamp, (self._count - 1) % SEQUENCE_SPAN, parts)]

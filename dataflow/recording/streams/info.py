@@ -29,6 +29,13 @@ class StreamSummary:
     declared_otherwise: bool
 
 
+_SAME = (
+    *("name", "schema", "encoding", "count", "first", "last", "static", "bytes", "incarnations"),
+    *("generic", "declared_otherwise"),
+)
+"""Facts that a summary takes over as they are."""
+
+
 @dataclass(frozen=True, slots=True)
 class AttachmentSummary:
     """One file that the recording carries."""
@@ -102,18 +109,8 @@ def _summary(recording: Recording, name: str) -> StreamSummary:
     info = recording.streams[name]
     span = 0 if info.first is None or info.last is None else info.last - info.first
     return StreamSummary(
-        name=name,
         type=info.message_type.SCHEMA if info.message_type else info.metadata.get("message_type", ""),
-        schema=info.schema,
-        encoding=info.encoding,
-        count=info.count,
         rate=(info.count - 1) / (span / 1e9) if info.count > 1 and span > 0 else None,
-        first=info.first,
-        last=info.last,
-        static=info.static,
-        bytes=info.bytes,
-        incarnations=info.incarnations,
         readable=info.message_type is not None,
-        generic=info.generic,
-        declared_otherwise=info.declared_otherwise,
+        **{same: getattr(info, same) for same in _SAME},
     )

@@ -86,26 +86,19 @@ def decode_fields(value: Any, fields: Iterable[Field]) -> dict[str, Any]:
     return found
 
 
-class _Long:
-    """A long array in a JSON object to be encoded."""
-
-    def __init__(self, data: memoryview) -> None:
-        self.data = data
-
-
 _PLACE = "\0"
 _PLACED = b'"base64":"\\u0000"'
 """The text in the place of a long array. Before the last ones, a field that is named base64 may read so too."""
 
 
 def encode_object(value: Mapping[str, Any]) -> bytes:
-    """The text of a JSON object, such as `encode_fields` makes."""
+    """The text of a JSON object, such as `encode_fields` makes: long arrays are memory in it."""
     long: list[memoryview] = []
 
     def place(thing: Any) -> str:
-        if not isinstance(thing, _Long):
+        if not isinstance(thing, memoryview):
             raise TypeError(f"a {type(thing).__name__} is no JSON value")
-        long.append(thing.data)
+        long.append(thing)
         return _PLACE
 
     text = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"), default=place).encode(value)
@@ -207,21 +200,17 @@ def _schemas(spec: Field) -> tuple[dict[str, Any], dict[str, Any] | None]:
 
 def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any], exact: dict[str, Any]) -> None:
     if data.size > MAX_LISTED or not _listable(data):
-        exact[spec.name] = {
-            "dtype": _dtype_name(data.dtype),
-            "shape": list(data.shape),
-            "base64": _base64(data),
-        }
+        exact[spec.name] = {"dtype": _dtype_name(data.dtype), "shape": list(data.shape), "base64": _base64(data)}
         return
     plain[spec.name] = data.ravel().tolist()
     if data.ndim != 1 or data.dtype != spec.dtypes[0]:
         exact[spec.name] = {"dtype": _dtype_name(data.dtype), "shape": list(data.shape)}
 
 
-def _base64(data: npt.NDArray[Any]) -> str | _Long:
+def _base64(data: npt.NDArray[Any]) -> str | memoryview:
     if not data.size:
         return ""
-    return base64.b64encode(data.data).decode() if data.nbytes < LONG_BYTES else _Long(data.data)
+    return base64.b64encode(data.data).decode() if data.nbytes < LONG_BYTES else data.data
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:

@@ -13,7 +13,6 @@ from functools import cached_property
 from itertools import accumulate, groupby, pairwise
 from pathlib import Path
 
-import numpy as np
 from mcap.records import Channel, Schema
 
 from dataflow.recording.errors import RecordingError
@@ -208,8 +207,7 @@ class _JoinedIndex:
         return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     def entries(self, channel: int) -> Entries:
-        parts = [Entries(*(np.empty(0, np.int64) for _ in range(3))), *self.blocks(channel, None, None)]
-        return Entries(*map(np.concatenate, zip(*(part.columns for part in parts), strict=True)))
+        return Entries.joined(self.blocks(channel, None, None))
 
     def blocks(self, channel: int, start: int | None, end: int | None) -> Iterator[Entries]:
         for number, own, after, _ in self._parts_of(channel):

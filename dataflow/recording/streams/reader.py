@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -57,7 +56,7 @@ class Recording:
             PartedFile(self.path, parts, watch=watch) if parts else file or opened(self.path, watch=watch)
         )
         try:
-            self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
+            self.metadata: Mapping[str, Mapping[str, str]] = merged_metadata(self._file.metadata)
             _check_format(self.path, self.metadata)
             self._streams = StreamFinder(self._file).all()
         except BaseException:
@@ -112,10 +111,7 @@ class Recording:
         return str(self._file.header.profile)
 
     def messages(
-        self,
-        streams: Sequence[str] | None = None,
-        start: int | None = None,
-        end: int | None = None,
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
     ) -> Iterator[Recorded]:
         """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream), whatever their order in the file.
 
@@ -138,7 +134,7 @@ class Recording:
         rows_of = self._rows([found], start, end, by_log_time=False)
         return (row[4] if found.own else row[0] for _, row in rows_of)
 
-    def index(self, stream: str, start: int | None = None, end: int | None = None) -> StreamIndex[Recorded]:
+    def index(self, stream: str, start: int | None = None, end: int | None = None) -> StreamIndex:
         """Random access to the messages of one stream with start ≤ stamp ≤ end (ns), in the order of `messages()`.
 
         Nothing is decoded before it is asked for, foreign streams aside, whose stamps lie within their messages. Valid
@@ -256,9 +252,7 @@ class Recording:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # ------------------------------------------------------------------------------------------------- streams
@@ -362,7 +356,7 @@ def _within(entries: Entries, start: int | None, end: int | None) -> Entries:
     return entries.where(kept)
 
 
-def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
+def merged_metadata(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
     """Metadata by name; of one name and key the latest counts."""
     merged: dict[str, dict[str, str]] = {}
     for name, mapping in records:

@@ -44,8 +44,7 @@ def _companions(file: File, stream: IndexedStream, channel: StreamChannel, entri
         return None
     whole = len(entries) == channel.count
     span = None if whole else (int(entries.times.min()), int(entries.times.max()))
-    parts = list(file.index.blocks(channel.companion, *(span or (None, None))))
-    companion = Entries(*map(np.concatenate, zip(*(part.columns for part in parts), strict=True)))
+    companion = Entries.joined(file.index.blocks(channel.companion, *(span or (None, None))))
     if span is not None:
         companion = companion.where((companion.times >= span[0]) & (companion.times <= span[1]))
     found = companions_of(entries.times, companion)

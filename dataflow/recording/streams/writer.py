@@ -8,7 +8,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from dataflow.messages import Transforms
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.errors import RecordingError
@@ -23,7 +22,6 @@ from dataflow.recording.layout import (
     Kind,
     events_topic,
     firings_topic,
-    frames_topic,
     library,
     logs_topic,
 )
@@ -32,7 +30,7 @@ from dataflow.recording.mcap.container import CHUNK_BYTES, CHUNK_SECONDS, Contai
 from dataflow.recording.mcap.packing import Buffer, Compression
 from dataflow.recording.parts import OWNER_ONLY
 from dataflow.recording.streams.codecs import Codec, SchemaText, codec_for, declaration_metadata
-from dataflow.recording.streams.frames import FrameTree
+from dataflow.recording.streams.frames import FrameChannel
 from dataflow.recording.streams.json_codec import TIMESTAMP, encode_object, timestamp_object
 from dataflow.recording.streams.logs import SCHEMA as LOG_SCHEMA
 from dataflow.recording.streams.logs import SCHEMA_NAME as LOG_SCHEMA_NAME
@@ -89,14 +87,11 @@ class RecordingWriter:
         )
         self._namespace = namespace
         self._streams: dict[str, _Stream] = {}
-        self._firings: dict[str, tuple[int, int]] = {}
+        self._run: dict[str, tuple[int, int]] = {}
+        """Channels of the run's records by topic, and how many each has."""
         self._untouched: dict[str, tuple[int, int]] = {}
-        self._events: tuple[int, int] | None = None
-        self._logs: tuple[int, int] | None = None
         self._newest = 0
-        self._frames = FrameTree()
-        self._frames_channel: int | None = None
-        self._frames_written = 0
+        self._frames = FrameChannel(self._file, namespace)
         try:
             self._file.add_metadata(RECORDING, {"format": FORMAT, "namespace": namespace})
             for name, mapping in metadata.items():
@@ -135,12 +130,7 @@ class RecordingWriter:
         return self._file.saved(stream)
 
     def add_stream(
-        self,
-        stream: str,
-        message_type: type[Message],
-        *,
-        static: bool = False,
-        extra: Mapping[str, str] | None = None,
+        self, stream: str, message_type: type[Message], *, static: bool = False, extra: Mapping[str, str] | None = None
     ) -> None:
         """Declares a stream. `extra` joins the channel's metadata (operator, port).
 
@@ -157,7 +147,7 @@ class RecordingWriter:
         clash = metadata.keys() & (extra or {}).keys()
         if clash:
             raise RecordingError(f"{self.path}: stream {stream!r}: extra must not set {', '.join(sorted(clash))}")
-        added = _Stream(stream, message_type, codec, metadata | dict(extra or {}), self._schema(codec.schema()), static)
+        added = _Stream(stream, message_type, codec, metadata | dict(extra or {}), self._schema(codec.schema), static)
         self._streams[stream] = added
         self._open_channel(added, 0, 0)
 
@@ -180,8 +170,7 @@ class RecordingWriter:
         group: list[tuple[int, int, int, list[Buffer]]] = [(known.channel, stamp, sequence, list(parts))]
         if extra is not None:
             group.append((self._companion(known), stamp, sequence, [extra]))
-        group += self._frame_group(stream, message)
-        self._file.add_messages(group)
+        self._file.add_messages([*group, *self._frames.derived(stream, message)])
         known.last_seq, known.last_stamp = seq, stamp
         known.digest.update(message.digest())
         self._newest = max(self._newest, stamp)
@@ -190,9 +179,8 @@ class RecordingWriter:
         """Declares a topic of another program whose messages are kept as they are."""
         if topic in self._untouched:
             raise RecordingError(f"{self.path}: topic {topic!r} is declared twice")
-        known = self._schema(schema) if schema.name else 0
         others = {key: value for key, value in metadata.items() if key != "kind"}
-        self._untouched[topic] = (self._file.add_channel(topic, encoding, known, others), 0)
+        self._untouched[topic] = (self._file.add_channel(topic, encoding, self._schema(schema), others), 0)
 
     def write_untouched(self, topic: str, log_time: int, data: bytes) -> None:
         """Adds a message of such a topic, byte for byte."""
@@ -205,40 +193,40 @@ class RecordingWriter:
 
         A `stamp` that is no time (the epoch or before it, or forever) is logged at the newest time so far.
         """
-        channel, count = self._firings.get(operator) or (self._add_firings_channel(operator), 0)
-        self._file.add_record(channel, self._log_time(stamp), count % SEQUENCE_SPAN, payload)
-        self._firings[operator] = (channel, count + 1)
+        topic, metadata = firings_topic(self._namespace, operator), {"kind": Kind.FIRINGS, "operator": operator}
+        self._record(topic, "msgpack", SchemaText("", "", b""), metadata, self._log_time(stamp), payload)
 
     def write_event(self, name: str, stamp: int, mapping: Mapping[str, Any]) -> None:
         """Adds an event of the run (a gap, an incarnation, a fault) as JSON. `mapping` holds JSON values.
 
         A `stamp` that is no time (the epoch or before it, or forever) is logged at the newest time so far.
         """
-        if self._events is None:
-            schema = self._schema(SchemaText("dataflow.Event", "jsonschema", EVENT_SCHEMA))
-            topic = events_topic(self._namespace)
-            self._events = (self._file.add_channel(topic, "json", schema, {"kind": Kind.EVENTS}), 0)
-        channel, count = self._events
         log_time = self._log_time(stamp)
         body = {TIMESTAMP: timestamp_object(log_time), "event": name, "stamp": str(stamp), "data": dict(mapping)}
         try:
             data = encode_object(body)
         except (TypeError, ValueError) as error:
             raise RecordingError(f"{self.path}: event {name!r} does not hold JSON values only: {error}") from error
-        self._file.add_record(channel, log_time, count % SEQUENCE_SPAN, data)
-        self._events = (channel, count + 1)
+        schema = SchemaText("dataflow.Event", "jsonschema", EVENT_SCHEMA)
+        self._record(events_topic(self._namespace), "json", schema, {"kind": Kind.EVENTS}, log_time, data)
 
     def write_log(self, stamp: int, line: LogLine) -> None:
         """Adds a line of the log. A `stamp` that is no time is logged at the newest time so far."""
-        if self._logs is None:
-            schema = self._schema(SchemaText(LOG_SCHEMA_NAME, "jsonschema", LOG_SCHEMA))
-            topic = logs_topic(self._namespace)
-            self._logs = (self._file.add_channel(topic, "json", schema, {"kind": Kind.LOGS}), 0)
-        channel, count = self._logs
         log_time = self._log_time(stamp)
         data = encode_object({TIMESTAMP: timestamp_object(log_time), **line.recorded()})
+        schema = SchemaText(LOG_SCHEMA_NAME, "jsonschema", LOG_SCHEMA)
+        self._record(logs_topic(self._namespace), "json", schema, {"kind": Kind.LOGS}, log_time, data)
+
+    def _record(
+        self, topic: str, encoding: str, schema: SchemaText, metadata: Mapping[str, str], log_time: int, data: bytes
+    ) -> None:
+        """Adds a record of the run to the channel of a topic, which is declared with the first."""
+        channel, count = self._run.get(topic) or (
+            self._file.add_channel(topic, encoding, self._schema(schema), metadata),
+            0,
+        )
         self._file.add_record(channel, log_time, count % SEQUENCE_SPAN, data)
-        self._logs = (channel, count + 1)
+        self._run[topic] = channel, count + 1
 
     def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
         """Adds a metadata record, now or later; of one name and key the latest counts."""
@@ -300,7 +288,7 @@ class RecordingWriter:
             )
 
     def _schema(self, schema: SchemaText) -> int:
-        return self._file.add_schema(schema.name, schema.encoding, schema.data)
+        return self._file.add_schema(schema.name, schema.encoding, schema.data) if schema.name else 0
 
     def _open_channel(self, stream: _Stream, incarnation: int, base: int) -> None:
         """The channel of one incarnation of a stream, and of 2^32 of its sequence numbers."""
@@ -313,7 +301,7 @@ class RecordingWriter:
 
     def _companion(self, stream: _Stream) -> int:
         if not stream.companion:
-            schema = stream.codec.companion_schema()
+            schema = stream.codec.companion_schema
             assert schema is not None, f"{stream.message.SCHEMA} has a companion without a schema"
             metadata = {
                 "kind": Kind.COMPANION,
@@ -324,26 +312,6 @@ class RecordingWriter:
             topic = stream.name + COMPANION_SUFFIX
             stream.companion = self._file.add_channel(topic, "json", self._schema(schema), metadata)
         return stream.companion
-
-    def _frame_group(self, stream: str, message: Message) -> list[tuple[int, int, int, list[Buffer]]]:
-        """The derived transforms that let other people's viewers put things in place."""
-        group: list[tuple[int, int, int, list[Buffer]]] = []
-        for transforms in self._frames.transforms(stream, message):
-            codec = codec_for(Transforms)
-            if self._frames_channel is None:
-                topic = frames_topic(self._namespace)
-                schema = self._schema(codec.schema())
-                self._frames_channel = self._file.add_channel(
-                    topic, codec.message_encoding, schema, {"kind": Kind.FRAMES}
-                )
-            parts, _ = codec.encode(transforms)
-            group.append((self._frames_channel, message.stamp, self._frames_written % SEQUENCE_SPAN, list(parts)))
-            self._frames_written += 1
-        return group
-
-    def _add_firings_channel(self, operator: str) -> int:
-        metadata = {"kind": Kind.FIRINGS, "operator": operator}
-        return self._file.add_channel(firings_topic(self._namespace, operator), "msgpack", 0, metadata)
 
     def _log_time(self, stamp: int) -> int:
         if not 0 < stamp < FOREVER:

@@ -18,7 +18,8 @@ from typing import Any
 
 from dataflow.environments import Environment, environment_of
 from dataflow.execution.threads import environment
-from dataflow.process.channel import ChannelClosed, ready
+from dataflow.process.channel import ChannelClosed
+from dataflow.process.polling import readable
 from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, Watch
 from dataflow.supervision.interrupts import interrupts
 from dataflow.verification.workers.board import Board
@@ -79,7 +80,7 @@ def call_workers(
             workers.append(stack.enter_context(closing(worker)))
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
-            for channel in ready([worker.channel for worker in left], LOOK_EVERY):
+            for channel in readable([worker.channel for worker in left], LOOK_EVERY):
                 next(worker for worker in left if worker.channel is channel).hear()
             if interrupted.is_set():
                 raise RunFailed("interrupted", interrupted=True)

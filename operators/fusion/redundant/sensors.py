@@ -1,17 +1,110 @@
-"""Stores the latest measurements of each sensor and their consistency, for the fusion operators."""
+"""Redundant sensors: their latest measurements, noise that follows innovations, and what is not to be averaged."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Generic, TypeVar
 
-from dataflow.messages import Diagnostics, Message
-from dataflow.operator import Remembered
-from operators.fusion.redundant.agreement import Agreement
+import numpy as np
+from numpy.typing import NDArray
 
+from dataflow.messages import Diagnostics, Message
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import Remembered
+from operators.fusion.redundant.combination import contradicts
+from operators.status import Row, status_of_rows
+
+T = TypeVar("T")
 M = TypeVar("M", bound=Message)
+Array = NDArray[np.float64]
 _REPORTED = 1_000_000_000
+_SMOOTH, _SUDDEN, _LARGEST = 0.05, 20.0, 100.0
+
+
+class Agreement(Remembered):
+    """Follows how far each sensor is from the others: `noise` is by how much its covariance is too small.
+
+    Of three or more sensors one that contradicts the others is left out. Of two it is undecidable which is wrong: both
+    stay, and the result's covariance has to hold both. Innovation-based adaptation: Mehra, 1970.
+    """
+
+    split: int
+    _noise: dict[str, float]
+    _doubted: Counter[str]
+    _used: Counter[str]
+
+    def __init__(self, share: float) -> None:
+        self._share, self._noise, self.split = share, {}, 0
+        self._doubted, self._used = Counter(), Counter()
+
+    def noise(self, sensor: str) -> float:
+        """Returns the factor, 1 or more, on a sensor's covariance."""
+        return max(1.0, self._noise.get(sensor, 1.0))
+
+    def judge(
+        self,
+        names: Sequence[str],
+        seen: Sequence[T],
+        consistency: Callable[[Sequence[T]], tuple[float, int]],
+        misfits: Callable[[Sequence[T]], Array],
+    ) -> tuple[list[T], float]:
+        """Returns what is to be combined, and the factor by which the result's covariance grows.
+
+        `consistency`: squared residuals of all about what they say together, and their degrees of freedom; `misfits`:
+        squared distances of each from the others, over those explained.
+        """
+        kept, left, growth = list(names), list(seen), 1.0
+        while contradicts(together := consistency(left), self._share):
+            if len(left) == 2:
+                growth = together[0] / together[1]
+                self.split += 1
+                self._doubted.update(kept)
+                break
+            wrong = self._wrong(left, consistency)
+            self._doubted[kept[wrong]] += 1
+            self._follow(kept[wrong], _SUDDEN)
+            del kept[wrong], left[wrong]
+        if len(left) > 2:
+            for name, value in zip(kept, misfits(left).tolist(), strict=True):
+                self._follow(name, value)
+        self._used.update(kept)
+        return left, growth
+
+    def _wrong(self, seen: Sequence[T], consistency: Callable[[Sequence[T]], tuple[float, int]]) -> int:
+        """The one without which the others agree, as far as they can be compared, and best."""
+        found = []
+        for k in range(len(seen)):
+            total, freedom = consistency([*seen[:k], *seen[k + 1 :]])
+            agree = freedom > 0 and not contradicts((total, freedom), self._share)
+            found.append((not agree, -freedom if agree else 0, total / max(freedom, 1), k))
+        return min(found)[-1]
+
+    def _follow(self, sensor: str, misfit: float) -> None:
+        if np.isfinite(misfit):
+            grown = self.noise(sensor) * (1.0 + _SMOOTH * (min(misfit, _SUDDEN) - 1.0))
+            self._noise[sensor] = min(max(grown, 1.0), _LARGEST)
+
+    def status(self, stamp: int, ignored: Mapping[str, int]) -> Diagnostics:
+        """Returns a status for the whole and one for every sensor, and forgets the doubts that it reports."""
+        text = "sensors contradict each other" if self._doubted else "sensors agree"
+        rows: list[Row] = [
+            ("fusion", text, Level.WARN if self._doubted else Level.OK, {k: str(n) for k, n in sorted(ignored.items())})
+        ]
+        for sensor in sorted(set(self._used) | set(self._doubted)):
+            doubted = self._doubted[sensor]
+            text, level = ("contradicts the others", Level.WARN) if doubted else ("used", Level.OK)
+            noise = self.noise(sensor)
+            if noise > 2.0 and not doubted:
+                text, level = "covariance too small", Level.WARN
+            values = {"used": str(self._used[sensor]), "doubted": str(doubted), "noise": f"{noise:.2f}"}
+            rows.append((sensor, text, level, values))
+        self._doubted.clear()
+        return status_of_rows(stamp, rows)
+
+    @property
+    def doubted(self) -> bool:
+        return bool(self._doubted)
 
 
 class RedundantSensors(Remembered, Generic[M]):

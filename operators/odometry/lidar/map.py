@@ -50,9 +50,9 @@ def thinned(points: NDArray[np.floating[Any]], size: float) -> Rows:
     One to four in a hundred are lost where two cubes have one hash: an exact key, sorted, takes three to five times as
     long (1.7 to 3.3 ms of a turn of 114,000 points, for 0.6).
     """
-    cell = points * points.dtype.type(1 / size)
-    cell = np.floor(cell, out=cell).astype(np.int32).view(np.uint32)
-    slot = (cell[:, 0] * _HASH[0] ^ cell[:, 1] * _HASH[1] ^ cell[:, 2] * _HASH[2]) & np.uint32(_SLOTS - 1)
+    voxel = points * points.dtype.type(1 / size)
+    voxel = np.floor(voxel, out=voxel).astype(np.int32).view(np.uint32)
+    slot = (voxel[:, 0] * _HASH[0] ^ voxel[:, 1] * _HASH[1] ^ voxel[:, 2] * _HASH[2]) & np.uint32(_SLOTS - 1)
     slot = slot.astype(np.intp)
     first = _slots.numbers
     number = np.arange(len(points), dtype=np.int32)
@@ -60,18 +60,18 @@ def thinned(points: NDArray[np.floating[Any]], size: float) -> Rows:
     return np.flatnonzero(first.take(slot) == number)
 
 
-def _spread_bits(cell: Keys) -> Keys:
+def _spread_bits(voxel: Keys) -> Keys:
     """Returns 21-bit numbers with two zero bits before each bit."""
     for shift, mask in (
         (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
         (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
     ):  # fmt: skip
-        cell = (cell | (cell << shift)) & mask
-    return cell
+        voxel = (voxel | (voxel << shift)) & mask
+    return voxel
 
 
-def _cells(points: Array, size: float) -> Keys:
-    """Returns the cell (3, N) of every point in a grid of cubes, counted from a far corner; it must lie in the grid."""
+def _voxels(points: Array, size: float) -> Keys:
+    """Returns the voxel (3, N) of every point in a grid that it must lie in, counted from a far corner."""
     return np.floor(points.T * (1.0 / size)).astype(np.int64) + _OFFSET
 
 
@@ -195,8 +195,8 @@ class PlaneMap(Remembered):
         """
         if not len(points):
             return
-        cell = _cells(points, self._size / 2 ** (self._levels - 1))
-        code = _spread_bits(cell[0]) << 2 | _spread_bits(cell[1]) << 1 | _spread_bits(cell[2])
+        voxel = _voxels(points, self._size / 2 ** (self._levels - 1))
+        code = _spread_bits(voxel[0]) << 2 | _spread_bits(voxel[1]) << 1 | _spread_bits(voxel[2])
         order = np.argsort(code, kind="stable")
         code, down = code[order], 3 * (self._levels - 1)
         ordered, fresh = points.take(order, axis=0), []
@@ -223,8 +223,8 @@ class PlaneMap(Remembered):
     def pairs(self, points: Array) -> Pairs:
         """Returns the planes that points (N, 3) in the map's frame belong to."""
         finest = self._levels - 1
-        cell = _cells(points, self._size / 2**finest)
-        block_of = self._find(cell >> finest)
+        voxel = _voxels(points, self._size / 2**finest)
+        block_of = self._find(voxel >> finest)
         plane = np.zeros((len(points), 9))
         births = np.zeros(len(points), np.int64)
         known = np.zeros(len(points), np.bool_)
@@ -232,7 +232,7 @@ class PlaneMap(Remembered):
         for k, level in enumerate(self._rows):
             inside = np.zeros(len(todo), np.int64)
             for bit in range(k):
-                part = (cell[:, todo] >> (finest - k + bit)) & 1
+                part = (voxel[:, todo] >> (finest - k + bit)) & 1
                 inside |= (part[0] << 2 | part[1] << 1 | part[2]) << (3 * bit)
             rows = self._tables[k][block_of[todo], inside]
             there = rows >= 0
@@ -261,11 +261,11 @@ class PlaneMap(Remembered):
             self._tables[k] = table
             level.keep(rows.astype(np.intp))
 
-    def _find(self, cell: Keys) -> Rows:
-        """Returns the block of each cell (3, N) of the largest voxels, -1 where there is none."""
+    def _find(self, voxel: Keys) -> Rows:
+        """Returns the block of each voxel (3, N) of the largest voxels, -1 where there is none."""
         if not len(self._keys):
-            return np.full(cell.shape[1], -1, np.intp)
-        code = _spread_bits(cell[0]) << 2 | _spread_bits(cell[1]) << 1 | _spread_bits(cell[2])
+            return np.full(voxel.shape[1], -1, np.intp)
+        code = _spread_bits(voxel[0]) << 2 | _spread_bits(voxel[1]) << 1 | _spread_bits(voxel[2])
         at = np.searchsorted(self._keys, code)
         at[at == len(self._keys)] = 0
         return np.where(self._keys[at] == code, self._order[at], -1)

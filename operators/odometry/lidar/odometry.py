@@ -17,10 +17,12 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
-from operators.odometry.lidar.tracker import LidarTracker, State, Tracked, TrackerConfig
+from operators.odometry.lidar.tracker import LidarTracker, Tracked, TrackerConfig
+from operators.odometry.tracking import Status
+from operators.status import counted_status
 
 _STAMPED = {"begin": 0.0, "middle": 0.5, "end": 1.0}
-_LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
+_LEVELS = {Status.PREDICTED: Level.WARN, Status.LOST: Level.ERROR}
 
 
 class Sweep(BaseModel):
@@ -130,7 +132,7 @@ class LidarOdometry(Operator):
         self.state.counts[tracked.state.value] += 1
         self.state.counts["with a direction untold"] += len(tracked.blind) > 0
         messages: dict[str, Message] = {"status": _status(cloud.stamp, tracked)}
-        if tracked.state is not State.LOST:
+        if tracked.state is not Status.LOST:
             messages["odometry"] = self._odometry(cloud.stamp, body, T_body_lidar, tracked)
         return messages, tracked, T_body_lidar
 
@@ -157,12 +159,4 @@ class LidarOdometry(Operator):
 def _status(stamp: int, tracked: Tracked) -> Diagnostics:
     level = Level.WARN if len(tracked.blind) else _LEVELS.get(tracked.state, Level.OK)
     text = f"{tracked.state.value}: {tracked.reason}" if tracked.reason else tracked.state.value
-    return Diagnostics(
-        stamp=stamp,
-        names=("lidar_odometry",),
-        messages=(text,),
-        levels=np.array([level], np.uint8),
-        keys=("state", *tracked.counts),
-        values=(tracked.state.value, *(str(n) for n in tracked.counts.values())),
-        owners=np.zeros(1 + len(tracked.counts), np.int32),
-    )
+    return counted_status("lidar_odometry", stamp, text, level, {"state": tracked.state.value, **tracked.counts})

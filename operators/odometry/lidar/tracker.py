@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from operators.odometry.lidar.map import PlaneMap
 from operators.odometry.lidar.motion import LidarMotion, as_left, as_right, corrected
 from operators.odometry.lidar.scan import Scan, prepare
 from operators.odometry.lidar.search import ANY_TURN, apart, around, places
+from operators.odometry.tracking import Status
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
@@ -31,15 +31,6 @@ _TURN, _LARGEST_TURN = np.radians(4.0), np.radians(24.0)  # steps and reach of h
 _START_TURN = np.radians(20.0)  # per second, of a sensor whose velocity is unknown
 _STARTS, _LOST_STARTS, _FAR_STARTS = 3, 5, 12  # of which a pose is fitted
 _RIVAL, _FAR_RIVAL = 0.03, 0.05  # a second place whose agreement is that near to the best one's makes a pose ambiguous
-
-
-class State(StrEnum):
-    """Holds what the pose of a scan rests on."""
-
-    TRACKING = "tracking"  # this scan, or it begins the map
-    RELOCALISED = "relocalised"  # this scan, in the map found again after a loss
-    PREDICTED = "predicted"  # the motion so far
-    LOST = "lost"  # nothing for longer than the patience, or there is no map, or a new one begins
 
 
 @dataclass(frozen=True)
@@ -71,7 +62,7 @@ class Tracked:
     the stamp; None where the pose or the velocity was not measured.
     """
 
-    state: State
+    state: Status
     reason: str
     T: Matrix
     covariance: Matrix
@@ -133,7 +124,12 @@ class LidarTracker(Remembered):
             reason = _elsewhere(fits, _FAR_RIVAL if fresh else _RIVAL, anywhere=lost or fresh)
         if reason:
             return self._unmeasured(scan, stamp, reason)
-        return self._measured(scan, stamp, fits[0], State.RELOCALISED if lost else State.TRACKING)
+        return self._measured(scan, stamp, fits[0], Status.RELOCALISED if lost else Status.TRACKING)
+
+    @property
+    def _last(self) -> LidarMotion:
+        assert self._motion is not None
+        return self._motion
 
     def _patience(self, stamp: int) -> float:
         """Returns the seconds without a measured pose until the sensor is lost at a stamp: two scans at least."""
@@ -147,29 +143,27 @@ class LidarTracker(Remembered):
         self._first = scan
         self._epochs = [np.zeros((6, 6))]
         self._map.add(scan.points, 0, np.zeros(3))
-        return self._result(State.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
+        return self._result(Status.TRACKING, "the map begins here", scan, self._motion, np.zeros((6, 6)))
 
     def _anew(self, scan: Scan, stamp: int) -> Tracked:
         """Begins a new map where the sensor may be."""
-        assert self._motion is not None
         T, covariance = self._blindly(stamp)
-        gone = self._motion.seconds(stamp)
+        gone = self._last.seconds(stamp)
         self._motion, self._missed = LidarMotion(stamp, T, np.zeros(6), as_left(covariance, T)), 0
         self._map = PlaneMap(self._config.voxel, self._config.levels)
-        self._first, self._epochs, self._epoch_T = scan, [self._motion.covariance], T
+        self._first, self._epochs, self._epoch_T = scan, [self._last.covariance], T
         self._map.add(scan.points @ T[:3, :3].T + T[:3, 3], 0, T[:3, 3])
         reason = f"nothing was measured for {gone:.1f} s: a new map begins here"
-        return self._result(State.LOST, reason, scan, self._motion, covariance)
+        return self._result(Status.LOST, reason, scan, self._motion, covariance)
 
     def _starts(self, scan: Scan, stamp: int, lost: bool) -> list[Matrix]:
         """Returns where to look: at the predicted pose, and around it where the sensor may be far from there."""
-        assert self._motion is not None
-        T = self._motion.predicted(stamp, self._patience(stamp))
+        T = self._last.predicted(stamp, self._patience(stamp))
         reach, turn = self._strays(stamp)
         if lost:
-            unseen = self._motion.seconds(stamp) - self._patience(stamp)
+            unseen = self._last.seconds(stamp) - self._patience(stamp)
             turns = ANY_TURN
-            reach = min(_REACH + float(np.linalg.norm(self._motion.velocity[:3])) * unseen, _LOST_REACH)
+            reach = min(_REACH + float(np.linalg.norm(self._last.velocity[:3])) * unseen, _LOST_REACH)
         elif reach < _BASIN:
             return [T]
         else:
@@ -181,22 +175,19 @@ class LidarTracker(Remembered):
 
     def _strays(self, stamp: int) -> tuple[float, float]:
         """Returns how far from the prediction the sensor may be, in metres and radians, as far as is searched."""
-        assert self._motion is not None
-        config, dt = self._config, self._motion.seconds(stamp)
-        if self._motion.fresh:
+        config, dt = self._config, self._last.seconds(stamp)
+        if self._last.fresh:
             return min(config.start_speed * dt, _FARTHEST), min(_START_TURN * dt, _LARGEST_TURN)
         turn = 0.5 * config.angular_acceleration * dt**2
         return min(0.5 * config.acceleration * dt**2, _FARTHEST), min(turn, _LARGEST_TURN)
 
     def _far(self, stamp: int) -> bool:
         """Returns whether the sensor may be where a fit from the prediction is right by chance only."""
-        assert self._motion is not None
-        return self._strays(stamp)[0] > (_REACH if self._motion.fresh else _BASIN)
+        return self._strays(stamp)[0] > (_REACH if self._last.fresh else _BASIN)
 
     def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> list[Fit]:
         """Returns the pose that each start leads to, that of the most agreement first."""
-        motion = self._motion
-        assert motion is not None
+        motion = self._last
         config = self._config
         spread = motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
         certain = np.asarray(np.linalg.inv(spread), np.float64)
@@ -212,8 +203,7 @@ class LidarTracker(Remembered):
 
         As they were taken, both are skewed alike, so the motion between them comes out nearly right.
         """
-        motion, first = self._motion, self._first
-        assert motion is not None
+        motion, first = self._last, self._first
         assert first is not None
         found, *others = self._fitted(replace(scan, offsets=None), stamp, starts)
         points = deskewed(first.points, first.offsets, motion.velocity_to(found.T, stamp))
@@ -223,9 +213,8 @@ class LidarTracker(Remembered):
 
     def _doubt(self, found: Fit, stamp: int, lost: bool, far: bool) -> str:
         """Returns why a fit is not to be believed, or nothing; more is asked of one that may be `far` away."""
-        assert self._motion is not None
         config = self._config
-        unsearched = lost or (self._motion.fresh and self._missed > 0)  # it may be beyond all that was searched
+        unsearched = lost or (self._last.fresh and self._missed > 0)  # it may be beyond all that was searched
         min_known = max(config.min_known, 0.5) if unsearched else config.min_known
         min_inliers = max(config.min_inliers, 0.7) if far else config.min_inliers
         if found.known < min_known:
@@ -235,16 +224,15 @@ class LidarTracker(Remembered):
         if found.inliers < min_inliers:
             return f"{found.inliers:.0%} of the points on planes agree with them"
         if not lost:
-            off = se3.log(invert(self._motion.predicted(stamp, self._patience(stamp))) @ found.T)
-            spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+            off = se3.log(invert(self._last.predicted(stamp, self._patience(stamp))) @ found.T)
+            spread = self._last.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
             if off @ np.linalg.solve(spread, off) > 50:
                 step, turn = np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))
                 return f"it would mean a jump of {step:.2f} m and {turn:.1f} degrees from the motion so far"
         return ""
 
-    def _measured(self, scan: Scan, stamp: int, found: Fit, state: State) -> Tracked:
-        motion, config = self._motion, self._config
-        assert motion is not None
+    def _measured(self, scan: Scan, stamp: int, found: Fit, state: Status) -> Tracked:
+        motion, config = self._last, self._config
         self._first, self._missed = None, 0
         spread = motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
         share = np.bincount(found.births, found.weights, len(self._epochs)) / found.weights.sum()
@@ -252,7 +240,7 @@ class LidarTracker(Remembered):
         information = found.information / config.correlation
         covariance, own = corrected(found.T, information, spread, of_map, motion.covariance)
         dt = motion.seconds(stamp)
-        if state is State.RELOCALISED:  # a way crossed unseen is no evidence on the velocity
+        if state is Status.RELOCALISED:  # a way crossed unseen is no evidence on the velocity
             self._motion = LidarMotion(stamp, found.T, np.zeros(6), covariance)
             points = None
         else:
@@ -270,8 +258,7 @@ class LidarTracker(Remembered):
 
     def _grow(self, points: NDArray[np.float64]) -> None:
         """Adds a scan's points (N, 3), seen from the pose just measured, to the map."""
-        motion = self._motion
-        assert motion is not None
+        motion = self._last
         moved = se3.log(invert(self._epoch_T) @ motion.T)
         unsurer = np.linalg.eigvalsh(motion.covariance - _UNSURER * self._epochs[-1] - _SURE)[-1] > 0
         if unsurer or np.linalg.norm(moved[:3]) > _EPOCH[0] or np.linalg.norm(moved[3:]) > _EPOCH[1]:
@@ -287,23 +274,22 @@ class LidarTracker(Remembered):
         self._missed += 1
         if self._motion is None:
             nowhere = LidarMotion(stamp, np.eye(4), np.zeros(6), np.zeros((6, 6)))
-            return self._result(State.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
+            return self._result(Status.LOST, f"{reason}, and there is no map yet", scan, nowhere, np.zeros((6, 6)))
         T, covariance = self._blindly(stamp)
         lost = self._motion.seconds(stamp) > self._patience(stamp)
         velocity = np.zeros(6) if lost else self._motion.velocity
         there = replace(self._motion, T=T, velocity=velocity)
-        return self._result(State.LOST if lost else State.PREDICTED, reason, scan, there, covariance)
+        return self._result(Status.LOST if lost else Status.PREDICTED, reason, scan, there, covariance)
 
     def _blindly(self, stamp: int) -> tuple[Matrix, Matrix]:
         """Returns the predicted pose and the covariance of its right perturbation."""
-        assert self._motion is not None
         config = self._config
-        T = self._motion.predicted(stamp, self._patience(stamp))
-        spread = self._motion.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
-        return T, as_right(self._motion.covariance, T) + spread
+        T = self._last.predicted(stamp, self._patience(stamp))
+        spread = self._last.spread(stamp, config.acceleration, config.angular_acceleration, config.start_speed)
+        return T, as_right(self._last.covariance, T) + spread
 
     def _result(
-        self, state: State, reason: str, scan: Scan, motion: LidarMotion, covariance: Matrix,
+        self, state: Status, reason: str, scan: Scan, motion: LidarMotion, covariance: Matrix,
         velocity_covariance: Matrix | None = None, blind: NDArray[np.float64] | None = None,
         counts: Mapping[str, int] | None = None,
     ) -> Tracked:  # fmt: skip

@@ -13,13 +13,12 @@ from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix
-from operators.odometry.emission import outputs
 from operators.odometry.mono.ranging import MetricDepth
 from operators.odometry.mono.settings import MonoOdometryConfig, RangingConfig
 from operators.odometry.mono.tracker import MonoOdometry, MonoResult, MonoState
 from operators.odometry.mono.two_view import TwoViewConfig
 from operators.odometry.rgbd.odometry import camera_of
-from operators.odometry.tracking import Status, TrackResult
+from operators.odometry.tracking import Status, TrackResult, outputs
 
 
 @dataclass

@@ -15,12 +15,12 @@ from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
 from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import detect_corners
-from operators.odometry.keyframes import view_distance
+from operators.odometry.images import check_image
+from operators.odometry.keyframes import candidates, view_distance
 from operators.odometry.mono.initialisation import first_map
 from operators.odometry.mono.map import MonoMap, View
-from operators.odometry.mono.pose import PosedView, refined, solved
+from operators.odometry.mono.pose import PosedView, recognised, refined, solved
 from operators.odometry.mono.ranging import MetricDepth, Ranged, RangingMemory, RangingUse, pose_at, ranged
-from operators.odometry.mono.relocalizer import recognised
 from operators.odometry.mono.scale import Scale
 from operators.odometry.mono.settings import MonoOdometryConfig
 from operators.odometry.mono.tracks import MonoFrame, Tracks, from_view, observe
@@ -109,12 +109,16 @@ class MonoOdometry:
             return self._measured(frame, *found)
         return self._unmeasured(frame, tracks, T_predicted)
 
+    @property
+    def _motion(self) -> Motion:
+        assert self.state.motion is not None
+        return self.state.motion
+
     # -- the beginning -----------------------------------------------------------------------------------
 
     def _initialise(self, frame: MonoFrame) -> TrackResult:
         """Waits for a second view that gives points, before there is any map."""
-        motion = self.state.motion
-        assert motion is not None
+        motion = self._motion
         if motion.stamp < frame.stamp:
             self._set(motion=Motion(frame.stamp, motion.T_world_camera, np.zeros(6)))
         if frame.flaw is not None:
@@ -151,11 +155,10 @@ class MonoOdometry:
 
     def _predict(self, frame: MonoFrame) -> Matrix:
         state = self.state
-        assert state.motion is not None
         if state.scale.known and state.T_reference is not None and frame.T_reference is not None:
-            T: Matrix = state.motion.T_world_camera @ invert(state.T_reference) @ frame.T_reference
+            T: Matrix = self._motion.T_world_camera @ invert(state.T_reference) @ frame.T_reference
             return T
-        return state.motion.predict(frame.stamp, self.config.decay_s)
+        return self._motion.predict(frame.stamp, self.config.decay_s)
 
     def _solve(self, tracks: Tracks, K: Matrix) -> PosedView | None:
         """Returns the pose that the map's points give; `agree` is of all tracks, and true where there is no point."""
@@ -176,14 +179,13 @@ class MonoOdometry:
     def _measured(self, frame: MonoFrame, tracks: Tracks, fit: PosedView) -> TrackResult:
         """Takes up a measured pose, and makes the frame a keyframe where one is due."""
         state, config = self.state, self.config
-        assert state.motion is not None
         T, newest = fit.T_world_camera, state.map.newest
         tracks = replace(tracks.only(fit.agree), T_world_camera=T)
-        blind = state.motion.blind_s > config.patience_s
+        blind = self._motion.blind_s > config.patience_s
         step = SYSTEMATIC * np.linalg.inv(fit.information + 1e-6 * np.eye(6))
         covariance = moved_covariance(newest.covariance, newest.T_world_camera, T) + step
         self._set(
-            motion=state.motion.measured(frame.stamp, T), covariance=covariance, tracks=tracks, turns=0, beginning=None
+            motion=self._motion.measured(frame.stamp, T), covariance=covariance, tracks=tracks, turns=0, beginning=None
         )
         count = int(np.count_nonzero(state.map.find(tracks.numbers)[1]))
         before = int(np.count_nonzero(state.map.find(newest.numbers)[1]))
@@ -199,7 +201,6 @@ class MonoOdometry:
         """Remembers the frame, makes points of what it saw under a new angle, and adjusts the newest keyframes."""
         config, state = self.config, self.state
         assert state.tracks is not None
-        assert state.motion is not None
         tracks = self._replenished(state.tracks)
         grown = state.map.with_view(tracks.view(frame, state.covariance), config.keyframes, config.window)
         grown = grown.grown(frame.K, config.min_angle, config.gate * config.sigma)
@@ -210,7 +211,7 @@ class MonoOdometry:
         self._set(
             map=grown,
             tracks=replace(tracks.only(~np.isin(tracks.numbers, wrong)), T_world_camera=T),
-            motion=replace(state.motion, T_world_camera=T),
+            motion=replace(self._motion, T_world_camera=T),
         )
         self._rescale(factor, scale)
 
@@ -218,9 +219,7 @@ class MonoOdometry:
         """Looks for the view in the map, the nearest keyframe first and the others by turns."""
         known, config, turn = self.state.map, self.config, self.state.turns
         self._set(turns=turn + 1)
-        views = sorted(known.views, key=lambda v: view_distance(v.T_world_camera, T_predicted, 1.0))
-        others = views[1:]
-        chosen = [views[0], *(others[(turn * 2 + i) % len(others)] for i in range(min(RECALLED - 1, len(others))))]
+        chosen = candidates(known.views, T_predicted, 1, RECALLED - 1, turn, 1.0)
         found = recognised(frame.gray, known, chosen, frame.K)
         if found is None:
             return None
@@ -231,8 +230,7 @@ class MonoOdometry:
 
     def _unmeasured(self, frame: MonoFrame, tracks: Tracks, T_predicted: Matrix) -> TrackResult:
         """Goes on without points: by the rotation that corners hold, and with a new map after a while."""
-        state, config = self.state, self.config
-        assert state.motion is not None
+        state, motion, config = self.state, self._motion, self.config
         assert state.tracks is not None
         T, reason = T_predicted, f"{len(tracks.numbers)} corners followed, too few agree with the map"
         if len(tracks.numbers) >= config.two_view.min_points:
@@ -243,7 +241,7 @@ class MonoOdometry:
                 reason = f"no parallax: {len(tracks.numbers)} corners hold the rotation alone"
         elif len(detect_corners(frame.gray, config.corners)) < config.two_view.min_points:
             reason = f"{len(tracks.numbers)} corners: the view has too little texture"
-        blind = state.motion.blind_s + (frame.stamp - state.motion.stamp) * 1e-9
+        blind = motion.blind_s + (frame.stamp - motion.stamp) * 1e-9
         if blind <= config.patience_s + config.give_up_s:
             tracks = replace(tracks, T_world_camera=T)
             if len(tracks.numbers) < 0.5 * config.corners:
@@ -252,19 +250,17 @@ class MonoOdometry:
             return self._guessed(frame, T, reason)
         why = self._begin(frame, T)
         if why is None:
-            spread = state.motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
+            spread = motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
             self._set(covariance=state.covariance + spread)
             return self._result(Status.TRACKING, "a new map; its place in the old one is unknown", 0, keyframe=True)
         return self._guessed(frame, T, f"{reason}; for a new map: {why}")
 
     def _guessed(self, frame: MonoFrame, T: Matrix, reason: str) -> TrackResult:
-        state, config = self.state, self.config
-        assert state.motion is not None
-        spread = state.motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
-        covariance = moved_covariance(state.covariance, state.motion.T_world_camera, T) + spread
-        self._set(motion=state.motion.guessed(frame.stamp, T), covariance=covariance)
-        assert self.state.motion is not None
-        lost = self.state.motion.blind_s > config.patience_s
+        motion, config = self._motion, self.config
+        spread = motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
+        covariance = moved_covariance(self.state.covariance, motion.T_world_camera, T) + spread
+        self._set(motion=motion.guessed(frame.stamp, T), covariance=covariance)
+        lost = self._motion.blind_s > config.patience_s
         return self._result(Status.LOST if lost else Status.PREDICTED, reason, 0)
 
     # -- the scale ---------------------------------------------------------------------------------------
@@ -286,10 +282,10 @@ class MonoOdometry:
         """Brings the map to metres: about the camera, so that its pose stays; where they are known for the first time,
         about the place where the map began."""
         state = self.state
-        assert state.motion is not None
         if factor == 1.0 and scale == state.scale:
             return
-        T, velocity = state.motion.T_world_camera, state.motion.velocity * np.repeat([factor, 1.0], 3)
+        motion = self._motion
+        T, velocity = motion.T_world_camera, motion.velocity * np.repeat([factor, 1.0], 3)
         if scale.known and not state.scale.known:
             T = T.copy()
             T[:3, 3] = state.origin + factor * (T[:3, 3] - state.origin)
@@ -302,7 +298,7 @@ class MonoOdometry:
         self._set(
             scale=scale,
             tracks=replace(state.tracks, T_world_camera=T),
-            motion=replace(state.motion, T_world_camera=T, velocity=velocity),
+            motion=replace(motion, T_world_camera=T, velocity=velocity),
         )
 
     # -- corners -----------------------------------------------------------------------------------------
@@ -319,8 +315,7 @@ class MonoOdometry:
         self.state = replace(self.state, **changes)  # type: ignore[arg-type]
 
     def _result(self, status: Status, reason: str, inliers: int, keyframe: bool = False) -> TrackResult:
-        motion = self.state.motion
-        assert motion is not None
+        motion = self._motion
         return TrackResult(
             motion.stamp, motion.T_world_camera.copy(), self.state.covariance.copy(), motion.velocity.copy(),
             status, reason, inliers, 0.0, keyframe,
@@ -328,10 +323,7 @@ class MonoOdometry:
 
     def _look(self, image: NDArray[np.uint8], stamp: int, T_reference: Matrix | None) -> MonoFrame:
         """Checks an image and reduces it."""
-        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
-            raise ValueError(f"image must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
-        if min(image.shape[:2]) < 32:
-            raise ValueError(f"image must be at least 32 x 32 pixels, got {image.shape}")
+        check_image("image", image)
         state = self.state
         if state.shape not in (None, image.shape[:2]):
             raise ValueError(f"image size changed from {state.shape} to {image.shape[:2]}: one camera, one size")

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +10,7 @@ from operators.geometry.pinhole import Pixels, project, unproject
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray, detect_corners, track_both_ways
+from operators.odometry.images import gray_of, reduced
 from operators.odometry.mono.map import MonoMap, Numbers, View, found_in
 from operators.odometry.mono.two_view import turned
 from operators.odometry.rgbd.surface import scaled_intrinsics
@@ -34,12 +34,8 @@ def observe(
     image: NDArray[np.uint8], stamp: int, K: Matrix, width: int, last: Watch, T_reference: Matrix | None
 ) -> MonoFrame:
     """Reduces an image by whole factors to no less than a width, and looks for flaws, such as repeating the last."""
-    gray: Gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    factor = max(1, gray.shape[1] // width)
-    if factor > 1:
-        rows, columns = gray.shape[0] // factor, gray.shape[1] // factor
-        cropped = gray[: rows * factor, : columns * factor]
-        gray = np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+    factor = max(1, image.shape[1] // width)
+    gray = reduced(gray_of(image), factor)
     watch = Watch().seen(image, np.zeros((1, 1), np.float32))
     flaw = watch.image_flaw(last, gray)
     return MonoFrame(stamp, np.ascontiguousarray(gray), scaled_intrinsics(K, 1.0 / factor), flaw, T_reference, watch)

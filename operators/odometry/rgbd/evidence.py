@@ -138,13 +138,10 @@ def laid(
     """Returns points (N, 3) in another view, how far its surface lies behind each, in units of what they may differ by,
     and which are where it has one."""
     moved = transform_points(T_there_here, points)
-    h, w = surface.inverse_depth.shape
     z = moved[:, 2]
     ahead = z > 0.1
-    u, v = np.rint(project(np.where(ahead[:, None], moved, 1.0), surface.K)).astype(np.int64).T
-    inside = ahead & (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    inverse = surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
-    known = inside & (inverse > 0)
+    inverse = surface.inverse_at(np.where(ahead[:, None], moved, 1.0))
+    known = ahead & (inverse > 0)
     return moved, (1.0 / np.where(known, inverse, 1.0) - z) / (NEAR + slack * z * z), known
 
 

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray
+from operators.odometry.images import gray_of, reduced
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface, scaled_intrinsics
 
@@ -38,12 +38,8 @@ def observe(
     config: RgbdOdometryConfig, last: Watch,
 ) -> Frame:  # fmt: skip
     """Reduces the images by whole factors and looks for flaws, such as repeating those last watched."""
-    gray: Gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    factor = max(1, gray.shape[1] // config.image_width)
-    if factor > 1:
-        height, width = gray.shape[0] // factor, gray.shape[1] // factor
-        cropped = gray[: height * factor, : width * factor]
-        gray = np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    factor = max(1, image.shape[1] // config.image_width)
+    gray = reduced(gray_of(image), factor)
     block = max(1, depth.shape[1] // config.surface_width)
     surface = Surface.from_depth(depth, K_depth, config.near, config.far, block)
     watch = Watch().seen(image, depth)

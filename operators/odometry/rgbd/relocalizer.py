@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
-from operators.geometry.pinhole import Pixels, Points, project, unproject
+from operators.geometry.pinhole import Pixels, Points, unproject
 from operators.geometry.se3 import Matrix
 from operators.odometry.consensus import consensus
-from operators.odometry.features import Gray
 from operators.odometry.motion import Motion
 from operators.odometry.recognition import Description, describe, match, match_of_size
 from operators.odometry.rgbd.camera import RgbdCamera
@@ -40,15 +39,6 @@ VIEWS = 2  # keyframes that a recognised view is compared with
 SPARSE = 4  # patches of the view's surface between points by which these are chosen
 FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
 RECALL_PIXELS = 3.0  # working pixels by which such a feature may be off
-
-
-@dataclass(frozen=True, eq=False)
-class Recall:
-    """World points (N, 3) of a keyframe and where the view sees them (N, 2); wrong pairs are among them."""
-
-    keyframe: Keyframe
-    points_world: Points
-    pixels: Pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,49 +162,33 @@ def _by_pixels(
     frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
 ) -> Iterator[tuple[Fit, Keyframe]]:
     """Does as `recognised` where the view has no depth: by what it has in common with one keyframe."""
-    few, many = FEWEST_PIXELS, fitter.config.min_inliers
-    for recall in recalls(frame.gray, chosen, fitter.camera, few):
-        ages = np.zeros(len(recall.pixels), np.int64)
-        sighting = fitter.solve(recall.points_world, recall.pixels, ages, RECALL_PIXELS, few)
+    seen, found = describe(frame.gray), []
+    for keyframe in chosen:
+        pairs = match(keyframe.description, seen)
+        # Many of these points lie on edges, where either depth may do.
+        points, there = lifted(keyframe.description.pixels[pairs[:, 0]], keyframe.surface, fitter.camera)
+        if np.count_nonzero(there) >= FEWEST_PIXELS:
+            world = transform_points(keyframe.T_world_camera, points[there])
+            found.append((keyframe, world, seen.pixels[pairs[there, 1]]))
+    for keyframe, world, pixels in sorted(found, key=lambda pairs: -len(pairs[1])):
+        ages = np.zeros(len(pixels), np.int64)
+        sighting = fitter.solve(world, pixels, ages, RECALL_PIXELS, FEWEST_PIXELS)
         if sighting is None:
             continue
         sighting = replace(sighting, recognised=True)
-        fit = fitter.refine(frame, sighting, motion, T_predicted, known, recall.keyframe.segment)
-        if fit.inliers >= many:
-            yield fit, recall.keyframe
-
-
-def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewest: int) -> list[Recall]:
-    """Returns what keyframes have in common with a view, the most first; only those with enough pairs."""
-    seen = describe(gray)
-    found = []
-    for keyframe in keyframes:
-        pairs = match(keyframe.description, seen)
-        if len(pairs) < fewest:
-            continue
-        points, known = rough_points(keyframe, pairs[:, 0], camera)
-        if np.count_nonzero(known) >= fewest:
-            points_world = transform_points(keyframe.T_world_camera, points[known])
-            found.append(Recall(keyframe, points_world, seen.pixels[pairs[known, 1]]))
-    return sorted(found, key=lambda recall: -len(recall.pixels))
-
-
-def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
-    """Returns points (N, 3) of described pixels, and which are known: many lie on edges, where either depth may do."""
-    return lifted(keyframe.description.pixels[chosen], keyframe.surface, camera)
+        fit = fitter.refine(frame, sighting, motion, T_predicted, known, keyframe.segment)
+        if fit.inliers >= fitter.config.min_inliers:
+            yield fit, keyframe
 
 
 def lifted(pixels: Pixels, surface: Surface, camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
     """Returns the points (N, 3) of a surface that colour pixels (N, 2) see, depth camera, and which are known."""
-    inverse, (h, w) = surface.inverse_depth, surface.inverse_depth.shape
     rays = unproject(pixels, camera.K_color) @ camera.T_depth_color[:3, :3].T
     origin = camera.T_depth_color[:3, 3]
     points, known = origin + 2.0 * rays, np.zeros(len(rays), np.bool_)
     for _ in range(3):
-        u, v = np.rint(project(points, surface.K)).astype(np.int64).T
-        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-        seen = inverse[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
-        known = inside & (seen > 0)
+        seen = surface.inverse_at(points)
+        known = seen > 0
         z = np.where(known, 1.0 / np.where(known, seen, 1.0), points[:, 2]) - origin[2]
         points = origin + rays * (z / rays[:, 2])[:, None]
     return points, known

@@ -106,10 +106,7 @@ class Surface:
         smooth_q = cv2.blur(q, (3, 3))
         c = smooth_q - a * x[None, :] - b * y[:, None]
         hole = cv2.dilate(
-            (q == 0).astype(np.uint8),
-            np.ones((3, 3), np.uint8),
-            borderType=cv2.BORDER_CONSTANT,
-            borderValue=(1,),
+            (q == 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(1,)
         )
         rough = np.abs(q - smooth_q) > 0.02 * smooth_q
         scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))
@@ -123,10 +120,17 @@ class Surface:
 
     def planes_at(self, points: NDArray[np.float64]) -> Array32:
         """Returns the planes (N, 4) of the patches that points (N, 3) fall on, as `bordered_planes` has them."""
+        return np.asarray(self.bordered_planes.take(self._patches(points), axis=0), np.float32)
+
+    def inverse_at(self, points: NDArray[np.float64]) -> Array32:
+        """Returns the inverse depth (N,) of the patches that points (N, 3) fall on; 0 where there is none."""
+        return np.asarray(self.bordered.take(self._patches(points)), np.float32)
+
+    def _patches(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Returns which patches of the bordered grid points (N, 3) fall on."""
         h, w = self.inverse_depth.shape
         u, v = np.rint(project(points, self.K)).astype(np.int64).T
-        cells = np.clip(v + 1, 0, h + 1) * (w + 2) + np.clip(u + 1, 0, w + 1)
-        return np.asarray(self.bordered_planes.take(cells, axis=0), np.float32)
+        return np.asarray(np.clip(v + 1, 0, h + 1) * (w + 2) + np.clip(u + 1, 0, w + 1), np.int64)
 
     @cached_property
     def bordered(self) -> Array32:

@@ -16,6 +16,7 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, Vector
 from operators.monitoring.image_flaws import Watch
+from operators.odometry.images import check_image, check_size
 from operators.odometry.keyframes import RECALL_EVERY, RECALL_NEAR, RECALL_OTHERS, candidates, recall_due, view_distance
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
@@ -76,7 +77,7 @@ class RgbdOdometry:
         if self.state.motion is None or self.state.map.newest.empty:
             return self._start(frame)
         # 2. Predict the pose from the motion so far.
-        T_predicted = self.state.motion.predict(stamp, self.config.decay_s)
+        T_predicted = self._motion.predict(stamp, self.config.decay_s)
         # 3. Track the keyframe's corners and solve for the pose.
         sighting = self._follow(frame, T_predicted)
         # 4. Refine with the depth image, against the surfaces of nearby keyframes.
@@ -84,13 +85,18 @@ class RgbdOdometry:
         # 5. Failing that, after a gap, now and then, or in a new map, recognise the view by its descriptors.
         measured = self._measured(frame, fit)
         recalled = self._recall(frame, fit if measured else None, T_predicted)
-        self.state.intervals = (*self.state.intervals, stamp - self.state.motion.stamp)[-INTERVALS:]
+        self.state.intervals = (*self.state.intervals, stamp - self._motion.stamp)[-INTERVALS:]
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
             return self._relocalised(frame, fit if measured else None, T_predicted, *recalled)
         if measured and (refuted := self._contradicted(frame, fit)):
             return self._taken_back(frame, fit, refuted)
         return self._followed(frame, fit) if measured else self._guessed(frame, fit)
+
+    @property
+    def _motion(self) -> Motion:
+        assert self.state.motion is not None
+        return self.state.motion
 
     # -- the steps ---------------------------------------------------------------------------------------
 
@@ -125,20 +131,17 @@ class RgbdOdometry:
 
     def _refine(self, frame: Frame, sighting: Sighting | None, T_predicted: Matrix, known: Keyframe) -> Fit:
         """Refines a pose against the surfaces of a keyframe's segment."""
-        assert self.state.motion is not None
-        return self._fitter.refine(frame, sighting, self.state.motion, T_predicted, self.state.map, known.segment)
+        return self._fitter.refine(frame, sighting, self._motion, T_predicted, self.state.map, known.segment)
 
     def _after_gap(self, frame: Frame) -> bool:
         """Returns whether the camera was blind for so long that it may be at a place that looks alike."""
-        assert self.state.motion is not None
-        return self.state.motion.blind_s + (frame.stamp - self.state.motion.stamp) * 1e-9 > self.config.patience_s
+        return self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
 
     def _slow(self, frame: Frame) -> bool:
         """Returns whether a frame that comes after longer than the patience is as usual for its stream."""
-        assert self.state.motion is not None
         intervals = self.state.intervals
-        usual = len(intervals) > 1 and frame.stamp - self.state.motion.stamp <= LATE * float(np.median(intervals))
-        return self.state.motion.blind_s == 0.0 and usual
+        usual = len(intervals) > 1 and frame.stamp - self._motion.stamp <= LATE * float(np.median(intervals))
+        return self._motion.blind_s == 0.0 and usual
 
     def _measured(self, frame: Frame, fit: Fit) -> bool:
         """Returns whether a fit counts: after a gap with more evidence."""
@@ -153,7 +156,6 @@ class RgbdOdometry:
         What is tracked after a gap was looked for around a prediction: a place that more speaks for takes its place.
         In a stream that is slower than the patience every frame is such a one, so it is looked for now and then.
         """
-        assert self.state.motion is not None
         gap, apart = self._after_gap(frame), self.state.apart_since
         slow = gap and self._slow(frame)
         steady = tracked is not None and (slow or not gap)
@@ -167,7 +169,7 @@ class RgbdOdometry:
         newest = self.state.map.newest.segment
         others = self.state.map.elsewhere if steady and apart is not None else self.state.map.keyframes
         chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self.state.recalls)
-        for found, known in recognised(frame, chosen, self._fitter, self.state.motion, T_predicted, self.state.map):
+        for found, known in recognised(frame, chosen, self._fitter, self._motion, T_predicted, self.state.map):
             if known.segment != newest:
                 return found, known
             if tracked is not None and not self._likelier(frame, found, tracked):
@@ -185,12 +187,11 @@ class RgbdOdometry:
 
     def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Takes up a pose that was measured against the newest keyframes."""
-        assert self.state.motion is not None
         T, newest = fit.T_world_camera, self.state.map.newest
-        if self.state.motion.blind_s > self.config.patience_s:
-            self._try(frame.stamp, frame.stamp, self.state.motion.predict(frame.stamp, self.config.decay_s), T)
-        status = Status.RELOCALISED if self.state.motion.blind_s > self.config.patience_s else Status.TRACKING
-        self.state.motion = self.state.motion.measured(frame.stamp, T)
+        if self._motion.blind_s > self.config.patience_s:
+            self._try(frame.stamp, frame.stamp, self._motion.predict(frame.stamp, self.config.decay_s), T)
+        status = Status.RELOCALISED if self._motion.blind_s > self.config.patience_s else Status.TRACKING
+        self.state.motion = self._motion.measured(frame.stamp, T)
         self.state.noise = fit.noise
         covariance, sunk = carried(newest, T)
         self.state.covariance = covariance + fit.covariance
@@ -201,7 +202,6 @@ class RgbdOdometry:
         self, frame: Frame, tracked: Fit | None, T_predicted: Matrix, found: Fit, known: Keyframe
     ) -> TrackResult:
         """Takes up a pose that was found among older keyframes, and a new map that is `tracked` meanwhile with it."""
-        assert self.state.motion is not None
         T, apart = found.T_world_camera, known.segment != self.state.map.newest.segment
         since = self.state.apart_since if apart and tracked is not None else None
         before = T_predicted if tracked is None else tracked.T_world_camera
@@ -221,9 +221,8 @@ class RgbdOdometry:
 
     def _try(self, since: int, stamp: int, T_before: Matrix, T_found: Matrix) -> None:
         """Puts a place that is found on trial: what was placed since a stamp rests on it."""
-        assert self.state.motion is not None
-        spread = self.state.motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
-        covariance = moved_covariance(self.state.covariance, self.state.motion.T_world_camera, T_before) + spread
+        spread = self._motion.spread(stamp, self.config.acceleration, self.config.angular_acceleration)
+        covariance = moved_covariance(self.state.covariance, self._motion.T_world_camera, T_before) + spread
         running = [trial for trial in self.state.trials if not trial.over(stamp)]
         self.state.trials = with_trial(running, Trial.of(since, stamp, T_before, covariance, T_found))
 
@@ -256,15 +255,14 @@ class RgbdOdometry:
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
-        assert self.state.motion is not None
-        before, config = self.state.motion, self.config
+        before, config = self._motion, self.config
         # Depth that fits still holds the directions that it measures; the prediction fills in the others.
         T = fit.T_world_camera if fit.depth_agrees else before.predict(frame.stamp, config.decay_s)
         self.state.motion = before.guessed(frame.stamp, T)
         spread = before.spread(frame.stamp, config.acceleration, config.angular_acceleration)
         self.state.covariance = moved_covariance(self.state.covariance, before.T_world_camera, T) + spread
         reason = frame.flaws or f"{fit.inliers} corners agree, and depth does not determine the pose"
-        if self.state.motion.blind_s <= config.patience_s:
+        if self._motion.blind_s <= config.patience_s:
             return self._result(Status.PREDICTED, reason, fit, keyframe=False)
         if frame.image_flaw is None:
             fresh = self._keyframe(frame, None)
@@ -302,8 +300,7 @@ class RgbdOdometry:
 
     def _keyframe(self, frame: Frame, fit: Fit | None) -> Keyframe:
         """Makes a keyframe of a frame: the corners that agree with its fit, and new ones."""
-        assert self.state.motion is not None
-        T, config = self.state.motion.T_world_camera, self.config
+        T, config = self._motion.T_world_camera, self.config
         shape = frame.surface.inverse_depth.shape
         movers = fit.movers if fit else Movers.none(frame.surface.K, (shape[0], shape[1]))
         layers = self._layers(frame, T)
@@ -343,28 +340,25 @@ class RgbdOdometry:
 
     def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
         """Returns whether the camera can have come that far since it was last measured."""
-        assert self.state.motion is not None
-        reach = 0.3 + TOP_SPEED * (self.state.motion.blind_s + (stamp - self.state.motion.stamp) * 1e-9)
+        reach = 0.3 + TOP_SPEED * (self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9)
         return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)
 
     # -- results and state -------------------------------------------------------------------------------
 
     def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:
         """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
-        assert self.state.motion is not None
         if self.state.apart_since is None:
             return self._result(status, reason, fit, keyframe)
-        lost = self.state.motion.stamp - self.state.apart_since < self.config.give_up_s * 1e9
+        lost = self._motion.stamp - self.state.apart_since < self.config.give_up_s * 1e9
         reason += "; a new map, its place in the old one unknown"
         return self._result(Status.LOST if lost else status, reason, fit, keyframe)
 
     def _result(self, status: Status, reason: str, fit: Fit | None, keyframe: bool) -> TrackResult:
-        assert self.state.motion is not None
         return TrackResult(
-            stamp=self.state.motion.stamp,
-            T_world_camera=self.state.motion.T_world_camera.copy(),
+            stamp=self._motion.stamp,
+            T_world_camera=self._motion.T_world_camera.copy(),
             covariance=self.state.covariance.copy(),
-            velocity=self.state.motion.velocity.copy(),
+            velocity=self._motion.velocity.copy(),
             status=status,
             reason=reason,
             inliers=fit.inliers if fit else 0,
@@ -373,13 +367,10 @@ class RgbdOdometry:
         )
 
     def _check(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> None:
-        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
-            raise ValueError(f"image must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
+        check_image("image", image)
         if depth.dtype != np.float32 or depth.ndim != 2:
             raise ValueError(f"depth must be (H, W) float32 metres, got {depth.shape} {depth.dtype}")
-        for name, shape in (("image", image.shape), ("depth", depth.shape)):
-            if min(shape[:2]) < 32:
-                raise ValueError(f"{name} must be at least 32 x 32 pixels, got {shape}")
+        check_size("depth", depth.shape)
         shapes = (image.shape[:2], depth.shape)
         if self.state.shapes not in (None, shapes):
             raise ValueError(

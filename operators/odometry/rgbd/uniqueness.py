@@ -17,7 +17,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.facing import free_directions
-from operators.geometry.pinhole import Points, project
+from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.evidence import ALIKE, NEAR, STRIDE, SUPPORTERS, compared, levelled, sampled, slack_of
@@ -124,12 +124,8 @@ def _laid_out(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Returns the brightness that a camera sees at world points (N, 3) of a grid, and 1 where it sees these, else 0."""
     points = transform_points(invert(T_world_camera), grid)
-    z, (h, w) = points[:, 2], surface.inverse_depth.shape
-    u, v = np.rint(project(points, surface.K)).astype(np.int64).T
-    inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    inverse = surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
-    brightness = sampled(gray, points, camera)
-    seen = inside & (inverse > 0) & np.isfinite(brightness)
+    z, inverse, brightness = points[:, 2], surface.inverse_at(points), sampled(gray, points, camera)
+    seen = (inverse > 0) & np.isfinite(brightness)
     seen &= np.abs(1.0 / np.where(inverse > 0, inverse, 1.0) - z) < NEAR + slack * z * z
     return np.where(seen, brightness, 0.0).reshape(shape), seen.astype(np.float64).reshape(shape)
 

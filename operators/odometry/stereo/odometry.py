@@ -9,10 +9,10 @@ from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
-from operators.odometry.emission import outputs
 from operators.odometry.stereo.adjustment import StereoRig
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry, StereoState
+from operators.odometry.tracking import outputs
 
 
 @dataclass

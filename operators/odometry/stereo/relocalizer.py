@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from operators.depth.stereo_matching import MatchingConfig, StereoMatcher
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Flaw, Watch
 from operators.odometry.features import Gray
+from operators.odometry.images import reduced
 from operators.odometry.motion import Motion
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter
@@ -68,8 +68,8 @@ def kept_pair(
 ) -> StereoKeyframe:
     """Reduces a pair to what is kept of it."""
     factor = max(1, left.shape[1] // WIDTH)
-    small = [_reduced(image, factor) for image in (left, right)]
-    return StereoKeyframe(stamp, T_world_camera, covariance, small[0], small[1], factor, offset, segment)
+    small = reduced(left, factor), reduced(right, factor)
+    return StereoKeyframe(stamp, T_world_camera, covariance, *small, factor, offset, segment)
 
 
 class StereoRelocalizer:
@@ -83,11 +83,7 @@ class StereoRelocalizer:
         self._made: dict[int, tuple[StereoKeyframe, float, Keyframe]] = {}
 
     def found(
-        self,
-        view: StereoKeyframe,
-        chosen: Sequence[StereoKeyframe],
-        known: Sequence[StereoKeyframe],
-        unit: float,
+        self, view: StereoKeyframe, chosen: Sequence[StereoKeyframe], known: Sequence[StereoKeyframe], unit: float
     ) -> Iterator[FoundAgain]:
         """Yields the poses of a view among chosen keyframes of those known that all that is seen makes sure of.
 
@@ -160,14 +156,6 @@ class StereoRelocalizer:
     def _reach(self, kept: StereoKeyframe) -> float:
         """Returns focal length times baseline, reduced pixels times metres."""
         return float(self.rig.K[0, 0]) / kept.factor * self.rig.baseline
-
-
-def _reduced(gray: Gray, factor: int) -> Gray:
-    if factor == 1:
-        return gray
-    rows, columns = gray.shape[0] // factor, gray.shape[1] // factor
-    whole = gray[: rows * factor, : columns * factor]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _resized(T: NDArray[np.float64], factor: float) -> Matrix:

@@ -7,7 +7,6 @@ its sightings. Now and then a pair is kept, for a camera that was lost to find i
 
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Watch
 from operators.odometry.features import Gray, Mask, Pixels, detect_corners, track_both_ways
+from operators.odometry.images import check_image, gray_of
 from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
@@ -49,13 +49,10 @@ def observe(left: NDArray[np.uint8], right: NDArray[np.uint8], stamp: int, last:
     Raises ValueError for a wrong shape or type.
     """
     for name, image in (("left", left), ("right", right)):
-        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
-            raise ValueError(f"{name} must be (H, W) or (H, W, 3) uint8, got {image.shape} {image.dtype}")
-        if min(image.shape[:2]) < 32:
-            raise ValueError(f"{name} must be at least 32 x 32 pixels, got {image.shape}")
+        check_image(name, image)
     if left.shape[:2] != right.shape[:2]:
         raise ValueError(f"left and right differ in size: {left.shape[:2]} and {right.shape[:2]}")
-    grays = _gray(left), _gray(right)
+    grays = np.ascontiguousarray(gray_of(left)), np.ascontiguousarray(gray_of(right))
     none, flaws = np.zeros((1, 1), np.float32), list[str]()
     watches = Watch().seen(grays[0], none), Watch().seen(grays[1], none)
     for name, gray, watch, before in zip(("left", "right"), grays, watches, last, strict=True):
@@ -63,11 +60,6 @@ def observe(left: NDArray[np.uint8], right: NDArray[np.uint8], stamp: int, last:
         if flaw is not None:
             flaws.append(f"{name} image {flaw}")
     return StereoPair(stamp, *grays, "; ".join(flaws) or None, watches)
-
-
-def _gray(image: NDArray[np.uint8]) -> Gray:
-    gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    return np.ascontiguousarray(gray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +115,11 @@ class StereoOdometry:
             return self._relocalised(pair, T, again)
         return self._guessed(pair, T_predicted, reason) if T is None else self._measured(pair, T, pixels, agree, ~found)
 
+    @property
+    def _motion(self) -> Motion:
+        assert self.state.motion is not None
+        return self.state.motion
+
     # -- the steps ---------------------------------------------------------------------------------------
 
     def _follow(self, last: Gray, gray: Gray, T_predicted: Matrix) -> tuple[Pixels, Mask]:
@@ -143,7 +140,6 @@ class StereoOdometry:
     ) -> TrackResult:
         """Adds a frame to the window, adjusts it, and drops what is gone and what does not fit."""
         state, config = self.state, self.config
-        assert state.motion is not None
         kept = np.flatnonzero(agree)
         points, pixels = state.points[kept], pixels[kept]
         sightings, matched = self._across(pair, pixels, transform_points(invert(T_world_camera), points))
@@ -164,8 +160,8 @@ class StereoOdometry:
         status = Status.RELOCALISED if self._lost else Status.TRACKING
         self.state = replace(
             state,
-            covariance=moved_covariance(state.covariance, state.motion.T_world_camera, T) + step,
-            motion=state.motion.measured(pair.stamp, T),
+            covariance=moved_covariance(state.covariance, self._motion.T_world_camera, T) + step,
+            motion=self._motion.measured(pair.stamp, T),
             left=pair.left,
             poses=adjusted.poses,
             offset=adjusted.offset,
@@ -182,11 +178,10 @@ class StereoOdometry:
 
     def _guessed(self, pair: StereoPair, T: Matrix, reason: str) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
-        state, config = self.state, self.config
-        assert state.motion is not None
-        spread = state.motion.spread(pair.stamp, config.acceleration, config.angular_acceleration)
-        covariance = moved_covariance(state.covariance, state.motion.T_world_camera, T) + spread
-        self.state = replace(state, motion=state.motion.guessed(pair.stamp, T), covariance=covariance)
+        motion, config = self._motion, self.config
+        spread = motion.spread(pair.stamp, config.acceleration, config.angular_acceleration)
+        covariance = moved_covariance(self.state.covariance, motion.T_world_camera, T) + spread
+        self.state = replace(self.state, motion=motion.guessed(pair.stamp, T), covariance=covariance)
         if not self._lost:
             return self._result(Status.PREDICTED, reason, 0, 0.0)
         if pair.flaw is None:
@@ -212,8 +207,7 @@ class StereoOdometry:
     def _see_anew(self, pair: StereoPair) -> bool:
         """Begins the window at the pose so far; returns whether the pair shows enough for that."""
         state = self.state
-        assert state.motion is not None
-        T, none = state.motion.T_world_camera, StereoState()
+        T, none = self._motion.T_world_camera, StereoState()
         self.state = replace(
             state,
             left=pair.left,
@@ -235,8 +229,7 @@ class StereoOdometry:
     @property
     def _lost(self) -> bool:
         """Returns whether nothing was measured for longer than the patience."""
-        assert self.state.motion is not None
-        return self.state.motion.blind_s > self.config.patience_s
+        return self._motion.blind_s > self.config.patience_s
 
     def _view(self, pair: StereoPair, T_world_camera: Matrix, segment: int) -> StereoKeyframe:
         state = self.state
@@ -288,8 +281,7 @@ class StereoOdometry:
 
     def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
         """Returns whether the camera can have come that far since it was last measured."""
-        motion = self.state.motion
-        assert motion is not None
+        motion = self._motion
         speed = TOP_SPEED + float(np.linalg.norm(motion.velocity[:3]))
         reach = 0.3 + speed * (motion.blind_s + (stamp - motion.stamp) * 1e-9)
         return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)
@@ -344,17 +336,15 @@ class StereoOdometry:
 
     def _placed(self, status: Status, reason: str, inliers: int, matched: float) -> TrackResult:
         """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
-        since, motion = self.state.map.apart_since, self.state.motion
-        assert motion is not None
+        since = self.state.map.apart_since
         if since is None:
             return self._result(status, reason, inliers, matched)
-        lost = motion.stamp - since < self.config.give_up_s * 1e9
+        lost = self._motion.stamp - since < self.config.give_up_s * 1e9
         reason += "; a new map, its place in the old one unknown"
         return self._result(Status.LOST if lost else status, reason, inliers, matched)
 
     def _result(self, status: Status, reason: str, inliers: int, matched: float) -> TrackResult:
-        motion = self.state.motion
-        assert motion is not None
+        motion = self._motion
         return TrackResult(
             motion.stamp, motion.T_world_camera.copy(), self.state.covariance.copy(), motion.velocity.copy(),
             status, reason, inliers, matched, status in (Status.TRACKING, Status.RELOCALISED),

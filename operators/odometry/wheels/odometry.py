@@ -13,6 +13,7 @@ from dataflow.messages import Diagnostics, JointState, Odometry, WheelTicks
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.operator import KEPT, Counts, Duration, In, Operator, Out, Param
+from operators.geometry.planar import spatial
 from operators.odometry.wheels.differential_drive import DifferentialDrive, DriveNoise
 from operators.status import counted_status
 
@@ -208,17 +209,10 @@ class WheelOdometry(Operator):
             child_frame=self.base_frame,
             position=np.array([x, y, 0.0]),
             orientation=quaternion_from_yaw(yaw),
-            pose_covariance=_spatial(drive.covariance(), (0, 1, 5)),
+            pose_covariance=spatial(drive.covariance(), rest=_FLAT),
             linear=np.array([(left + right) / 2, 0.0, 0.0]),
             angular=np.array([0.0, 0.0, (right - left) / self.track]),
-            twist_covariance=_spatial(
-                drive.twist_covariance(float(rolled[0]), float(rolled[1]), seconds, doubt), (0, 5)
+            twist_covariance=spatial(
+                drive.twist_covariance(float(rolled[0]), float(rolled[1]), seconds, doubt), (0, 5), _FLAT
             ),
         )
-
-
-def _spatial(planar: Array, places: tuple[int, ...]) -> Array:
-    """The covariance (6, 6) of one of the named places; the rest is that of a flat floor."""
-    full = np.diag(np.full(6, _FLAT))
-    full[np.ix_(places, places)] = planar
-    return full

@@ -103,9 +103,9 @@ class Surroundings(Remembered):
         return min(float(drink.center[2]) - self._lowest.get(drink.id, float(drink.center[2])), 0.3)
 
     def _seat(self, now: Look, before: Look) -> tuple[float, float, float, float]:
-        away, seat = min(((_flat(b.center - now.center), b.id, b) for b in self._now["seat"]), default=(FAR, 0, None))[
-            ::2
-        ]
+        away, _, seat = min(
+            ((_flat(b.center - now.center), b.id, b) for b in self._now["seat"]), default=(FAR, 0, None)
+        )
         if seat is None or away >= FAR:
             return 1.0, 0.0, 0.0, 0.0
         closing = _flat(seat.center - before.center) - away
@@ -114,9 +114,9 @@ class Surroundings(Remembered):
         return away / FAR, closing, now.top - seat.bottom - 1.0, along
 
     def _table(self, now: Look, before: Look) -> tuple[float, float, float]:
-        apart, table = min(((_outside(b, now.center), b.id, b) for b in self._now["support"]), default=(FAR, 0, None))[
-            ::2
-        ]
+        apart, _, table = min(
+            ((_outside(b, now.center), b.id, b) for b in self._now["support"]), default=(FAR, 0, None)
+        )
         if table is None or apart >= FAR:
             return 1.0, 0.0, 0.0
         return apart / FAR, _outside(table, before.center) - apart, table.top

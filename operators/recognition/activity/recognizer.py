@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +14,52 @@ from numpy.typing import NDArray
 from dataflow.messages import Activity, Boxes3D, Classification, Odometry, Pose, SceneGraph
 from dataflow.operator import Counts, In, Operator, Out, Param, Remembered, Sampled
 from operators.labels import LabelSpace, labels_file
-from operators.recognition.activity.features import AgentWindow, Surroundings
-from operators.recognition.activity.model import ActivityModel
+from operators.recognition.activity.features import NAMES, AgentWindow, Surroundings
 from operators.recognition.activity.samples import STEP
 from operators.recognition.activity.scene_agents import mattering, seen_times
 from operators.scene.bodies import Body
 from operators.scene.graph.agents import UNKNOWN
-from operators.weights import shipped, trained_in_simulation
+from operators.weights import NetworkFileError, open_kind, shipped, trained_in_simulation
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 F32 = NDArray[np.float32]
+KIND = "activity"
 
 _SPAN = 0.5  # seconds
 _DOUBT = 0.01  # what a look leaves to an activity at least
+
+
+@dataclass(frozen=True, eq=False)
+class ActivityModel:
+    """An opened network. It runs on one CPU thread, so equal inputs give equal outputs."""
+
+    classes: tuple[str, ...]
+    layers: int
+    width: int
+    session: onnxruntime.InferenceSession
+
+    @classmethod
+    def open(cls, file: Path) -> ActivityModel:
+        """Raises FileNotFoundError, or NetworkFileError where the file is no activity network for our features."""
+        session, facts = open_kind(file, KIND, ("classes", "layers", "width"))
+        if tuple(facts.get("features", ())) != NAMES:
+            raise NetworkFileError(
+                f"{file} was trained on other features than these {len(NAMES)}: train one by `dataflow train {KIND}`"
+            )
+        return cls(tuple(map(str, facts["classes"])), int(facts["layers"]), int(facts["width"]), session)
+
+    def fresh(self) -> F32:
+        """Returns the state (2, L, W) of an agent that was never seen: hidden, then cell."""
+        return np.zeros((2, self.layers, self.width), np.float32)
+
+    def step(self, features: F32, states: F32) -> tuple[F32, F32]:
+        """Returns probabilities (N, C) and next states (N, 2, L, W) for features (N, F) and states (N, 2, L, W)."""
+        hidden, cell = (np.ascontiguousarray(states[:, k].transpose(1, 0, 2)) for k in (0, 1))
+        found = self.session.run(None, {"features": features, "hidden": hidden, "cell": cell})
+        probabilities, hidden, cell = (np.asarray(each, np.float32) for each in found)
+        return probabilities, np.stack([hidden.transpose(1, 0, 2), cell.transpose(1, 0, 2)], axis=1)
 
 
 class PostureWindow(Remembered):

@@ -1,7 +1,8 @@
-"""Sequences of feature vectors with what agents really did, made of episodes: data to train and to score on."""
+"""Sequences of feature vectors with what agents really did, of episodes: to train on and to score by."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import AgentWindow, Surroundings
 from operators.recognition.activity.tracked_people import Moment, tracked_moments, true_moments
+from operators.scene.graph.agents import UNKNOWN
 
 LAG = 0.25
 """Delay of the answers in seconds: the moments after a change separate a beginning activity from a passing look."""
@@ -77,6 +79,22 @@ def right_within(episode: Episode, sequence: Track, classes: Sequence[str], seco
         for r in near:
             right[k, classes.index(episode.activities[int(r)][column])] = True
     return right
+
+
+def macro_f1(true: Sequence[str], said: Sequence[str]) -> float:
+    """Returns the mean of F1 over all classes that are true or said at any time; 0 where there are none.
+
+    A class that is said and never true counts 0, as in scikit-learn. `unknown` is an answer and no class: a miss of the
+    true class, and false for none.
+    """
+    pairs = Counter(zip(true, said, strict=True))
+    scores = []
+    for name in sorted({*true, *said} - {UNKNOWN}):
+        hit = pairs[name, name]
+        false = sum(n for (t, s), n in pairs.items() if s == name != t)
+        miss = sum(n for (t, s), n in pairs.items() if t == name != s)
+        scores.append(2 * hit / (2 * hit + false + miss))
+    return sum(scores) / len(scores) if scores else 0.0
 
 
 def _closed(agent: int, rows: list[tuple[NDArray[np.float32], float, int, bool]]) -> Track:

@@ -17,22 +17,23 @@ from operators.learning.balance import class_weights
 from operators.learning.export import export_steps
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import NAMES
+from operators.recognition.activity.recognizer import KIND
 from operators.recognition.activity.samples import (
     LAG,
     Track,
     labels_of,
+    macro_f1,
     right_within,
     tracked_sequences,
     true_sequences,
 )
-from operators.recognition.activity.score import macro_f1
 from operators.recognition.activity.sensed_people import SensedTrack
 from operators.simulator.classes import ACTIVITIES
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 
 LAYERS = 2
-KIND = "activity"
 TOLERANCE = 0.5
+_STEPS = 120  # longest part of a track in one step of training
 _STRIDES = (1, 2, 2, 3, 4)
 _UNSEEN = 0.15  # how much a moment out of sight counts
 _LEAST = 0.35
@@ -116,11 +117,9 @@ class ActivityTask:
         repeats: int = 4,
         seed: int = 0,
         variations: int = 6,
-        width: int = 96,
-        steps: int = 120,
     ) -> None:
         torch.manual_seed(seed)
-        self.classes, self.steps = ACTIVITIES, steps
+        self.classes = ACTIVITIES
         self._episodes, self._variations = len(training), variations
         self._training = [
             (track.features, labels_of(episode, track, ACTIVITIES), np.where(track.seen, 1.0, _UNSEEN))
@@ -136,7 +135,7 @@ class ActivityTask:
         self._validation = scored_tracks(validation, seed)
         if sensed_validation:
             self._validation["sensed"] = [(t, t.now, t.right) for t in sensed_validation]
-        self.network = ActivityNetwork(len(NAMES), len(ACTIVITIES), width)
+        self.network = ActivityNetwork(len(NAMES), len(ACTIVITIES))
         every = np.concatenate([features for features, _, _ in self._training])
         self.network.mean.copy_(torch.from_numpy(every.mean(axis=0)))
         self.network.scale.copy_(torch.from_numpy(np.maximum(every.std(axis=0), 0.05)))
@@ -198,10 +197,10 @@ class ActivityTask:
     def _part(
         self, k: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float64]]:
-        """A part of a track of `steps` at most, from anywhere: tracks begin at any time."""
+        """A part of a track of `_STEPS` at most, from anywhere: tracks begin at any time."""
         features, labels, weights = self._training[k]
-        begin = int(rng.integers(max(1, len(labels) - self.steps // 2)))
-        rows = np.arange(begin, min(begin + self.steps, len(labels)))
+        begin = int(rng.integers(max(1, len(labels) - _STEPS // 2)))
+        rows = np.arange(begin, min(begin + _STEPS, len(labels)))
         rows, held = lingered(features[rows], labels[rows], rng)
         rows = rows + begin
         return varied(features[rows], held, rng), labels[rows], weights[rows]

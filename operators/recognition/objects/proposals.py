@@ -103,8 +103,8 @@ def color_map(pixels: NDArray[np.uint8]) -> F32:
     return np.asarray(cells.mean(axis=(2, 4)), np.float32)
 
 
-def inner_maps(file: Path, strides: Sequence[int] = (4, 8, 16)) -> tuple[str, ...]:
-    """Names the trunk's maps of these strides in a network of `dataflow train detector` or `pair`.
+def inner_maps(file: Path) -> tuple[str, ...]:
+    """Names the trunk's maps of strides 4, 8 and 16 in a network of `dataflow train detector` or `pair`.
 
     Needs the package onnx. Raises NetworkFileError where the network has none.
     """
@@ -113,9 +113,7 @@ def inner_maps(file: Path, strides: Sequence[int] = (4, 8, 16)) -> tuple[str, ..
     own = [int(s) for s in open_network(file, "detector").facts.get("strides", [])]
     model = onnx.load(str(file))
     names = []
-    for stride in strides:
-        if stride not in own:
-            continue
+    for stride in (s for s in (4, 8, 16) if s in own):
         lateral = [n for n in model.graph.node if n.op_type == "Conv" and f"/lateral.{own.index(stride)}/" in n.name]
         if lateral:
             names.append(lateral[0].input[0])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +15,36 @@ from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
 from operators.recognition.activity.scene_agents import seen_times
-from operators.recognition.posture.model import PostureModel
-from operators.recognition.posture.silhouette import silhouette
-from operators.weights import shipped, trained_in_simulation
+from operators.recognition.posture.silhouette import HALF, MIDDLE, SIDE, silhouette
+from operators.weights import open_kind, shipped, trained_in_simulation
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 F32 = NDArray[np.float32]
+KIND = "posture"
 
 _LEAST = 10  # points of a person
 _APART = 0.5  # metres on the ground between a node and the points that are of it
+
+
+@dataclass(frozen=True, eq=False)
+class PostureModel:
+    """An opened network. It runs on one CPU thread, so equal inputs give equal outputs."""
+
+    classes: tuple[str, ...]
+    session: onnxruntime.InferenceSession
+
+    @classmethod
+    def open(cls, file: Path) -> PostureModel:
+        """Raises FileNotFoundError, or NetworkFileError where the file is no posture network for our silhouettes."""
+        session, facts = open_kind(file, KIND, ("classes",), {"side": SIDE, "half": HALF, "middle": MIDDLE})
+        return cls(tuple(map(str, facts["classes"])), session)
+
+    def judge(self, silhouettes: F32) -> F32:
+        """Returns probabilities (N, C) for silhouettes (N, 3, SIDE, SIDE)."""
+        (found,) = self.session.run(None, {"silhouettes": silhouettes})
+        return np.asarray(found, np.float32)
 
 
 class PostureRecognizer(Operator):

@@ -15,7 +15,7 @@ from torch.nn import functional
 from operators.learning.balance import class_weights
 from operators.learning.export import export_rows
 from operators.recognition.posture.data import BODY, POSTURES, Postures
-from operators.recognition.posture.model import KIND
+from operators.recognition.posture.recognizer import KIND
 from operators.recognition.posture.silhouette import HALF, MIDDLE, SIDE
 from operators.weights.network_file import SIMULATOR, TRAINED_ON
 

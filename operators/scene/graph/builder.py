@@ -15,13 +15,14 @@ from dataflow.messages.scene_summary import ROOMS
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
+from operators.labels.label_space import warn_of_unknown
 from operators.scene.bodies import Body, BodyMemory
 from operators.scene.graph.agents import ACTIVITIES, UNKNOWN
 from operators.scene.graph.layers import BUILDING, Act, GraphSettings, LayeredGraph, Snapshot
 from operators.scene.graph.rooms import RoomPlan
-from operators.scene.known_classes import warn_of_unknown
 from operators.scene.map.map_surface import SURFACES
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
+from operators.status import Row, status_of_rows
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
@@ -226,17 +227,12 @@ class SceneGraphBuilder(Operator):
         return "" if act.goal < 0 else f"{self.state.names[act.goal]} ({act.goals[act.goal]:.2f})"
 
     def _changes(self, stamp: int, now: Snapshot) -> Diagnostics:
-        rows: list[tuple[str, str, Level]] = []
-        rows += [(self.state.names[i], "appeared", Level.OK) for i in now.appeared]
-        rows += [(self.state.names[i], "vanished", Level.WARN) for i in now.vanished]
+        names = self.state.names
+        rows: list[Row] = [(names[i], "appeared", Level.OK, {}) for i in now.appeared]
+        rows += [(names[i], "vanished", Level.WARN, {}) for i in now.vanished]
         for relations, level, word in ((now.began, Level.OK, "begins"), (now.ended, Level.WARN, "ends")):
-            rows += [(self.state.names[s], f"{p} {self.state.names[o]} {word}", level) for s, p, o in relations]
-        return Diagnostics(
-            stamp=stamp,
-            names=tuple(name for name, _, _ in rows),
-            messages=tuple(text for _, text, _ in rows),
-            levels=np.array([level for _, _, level in rows], np.uint8),
-        )
+            rows += [(names[s], f"{p} {names[o]} {word}", level, {}) for s, p, o in relations]
+        return status_of_rows(stamp, rows)
 
 
 def _in_sight(nodes: SceneGraph) -> NDArray[np.bool_]:

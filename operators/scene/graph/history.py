@@ -15,9 +15,7 @@ from operators.scene.graph.query import QueryError
 
 Array = NDArray[np.float64]
 
-MOVED = 0.3
-"""Metres from where it was last told to be, from which on a node has moved."""
-
+_MOVED = 0.3  # metres from where it was last told to be, from which on a node has moved
 _FLEETING = SURROUNDINGS | {"facing", "approaching"}
 
 
@@ -29,12 +27,10 @@ class Event:
     text: str
 
 
-def history(
-    graphs: Iterable[SceneGraph], activities: Mapping[int, Activity], node: str, moved: float = MOVED
-) -> list[Event]:
+def history(graphs: Iterable[SceneGraph], activities: Mapping[int, Activity], node: str) -> list[Event]:
     """Returns what happened to a node, named as in the graph (`mug 12`), over graphs of rising stamps.
 
-    That is: it appears, is elsewhere by more than `moved` metres, does something else, heads for something else, begins
+    That is: it appears, is elsewhere by more than 0.3 m, does something else, heads for something else, begins
     and ends relations (but those that say only what is around it), vanishes. `activities` are by stamp. Raises
     QueryError for a node that no graph has.
     """
@@ -56,7 +52,7 @@ def history(
         if place is None:
             events.append(Event(graph.stamp, f"appears at {_place(here)}"))
             place = here
-        elif float(np.linalg.norm(here - place)) > moved:
+        elif float(np.linalg.norm(here - place)) > _MOVED:
             events.append(Event(graph.stamp, f"is at {_place(here)}"))
             place = here
         doing = _activity(activities.get(graph.stamp), int(graph.ids[k]))

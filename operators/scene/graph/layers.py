@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.operator import Remembered
 from operators.scene.bodies import Body, BoxPairs
-from operators.scene.graph.agents import Motion, activity_of
-from operators.scene.graph.goals import GoalInference
+from operators.scene.graph.agents import GoalInference, Motion, activity_of
 from operators.scene.graph.rooms import RoomPlan
 from operators.scene.relations import FLOOR, ROBOT, ROOM, Hysteresis, Relation, RelationRules, relations_of
 
 Array = NDArray[np.float64]
+_LEAST_GOAL = 0.1  # probability of a goal that is named
 BUILDING = "building"
 """Class of the node around everything where there are several rooms."""
 
@@ -28,10 +27,6 @@ class GraphSettings:
     begin: float = 0.5
     end: float = 0.25
     smoothing: float = 0.4
-    trust: float = 1.0
-    memory: float = 2.0
-    elsewhere: float = 2.5
-    least_goal: float = 0.1
     rules: RelationRules = field(default_factory=RelationRules)
 
 
@@ -83,10 +78,6 @@ class LayeredGraph(Remembered):
         self._hysteresis = Hysteresis(settings.begin, settings.end, settings.smoothing)
         self._motions, self._goals, self._acts, self._known = {}, {}, {}, set()
 
-    def new_part(self, kind: type[Any]) -> GoalInference:
-        s = self._settings
-        return GoalInference(s.trust, s.memory, s.elsewhere)
-
     def update(
         self,
         stamp: int,
@@ -118,7 +109,7 @@ class LayeredGraph(Remembered):
         goals = {b.id: self._goals_of(time, b, wanted, now) for b in people}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():
-            sure = {i: p for i, p in likely.items() if i >= 0 and p >= s.least_goal}
+            sure = {i: p for i, p in likely.items() if i >= 0 and p >= _LEAST_GOAL}
             held |= {(agent, "heads_for", i): p for i, p in sure.items()}
         shown = postures or {}
         acts = tuple(self._act(stamp, b, held, goals.get(b.id, {}), shown.get(b.id)) for b in bodies if b.agent)
@@ -130,7 +121,7 @@ class LayeredGraph(Remembered):
         self, time: float, agent: Body, wanted: Sequence[Body], now: Mapping[Relation, float]
     ) -> dict[int, float]:
         free = [b for b in wanted if (agent.id, "sitting_on", b.id) not in now]
-        return self._goals.setdefault(agent.id, self.new_part(GoalInference)).update(time, agent, free)
+        return self._goals.setdefault(agent.id, GoalInference()).update(time, agent, free)
 
     def _act(
         self,
@@ -176,16 +167,8 @@ def _with_room(bodies: Sequence[Body], T_world_robot: Array | None, rooms: RoomP
             made.append(Body(FLOOR, "floor", np.array([*middle, ground]), np.array([*(high - low), 0.0]), 0.0, still))
         center = np.array([*middle, (ground + height) / 2])
         made += [] if rooms is None else rooms.bodies(ground, height)
-        made.append(
-            Body(
-                ROOM,
-                "room" if rooms is None else BUILDING,
-                center,
-                np.array([*(high - low), height - ground]),
-                0.0,
-                still,
-            )
-        )
+        label = "room" if rooms is None else BUILDING
+        made.append(Body(ROOM, label, center, np.array([*(high - low), height - ground]), 0.0, still))
     if T_world_robot is not None:
         yaw = float(np.arctan2(T_world_robot[1, 0], T_world_robot[0, 0]))
         made.append(Body(ROBOT, "self", T_world_robot[:3, 3].copy(), np.zeros(3), yaw, still))

@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from operators.cloud.clustering import level_axes, upright_box
+from operators.cloud.clustering import connected, level_axes, upright_box
 from operators.cloud.filtering import Voxels
 from operators.scene.lifting.body_points import beyond, body_of
 
@@ -208,13 +206,7 @@ def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
 
 
 def _of_class(
-    near: Indices,
-    inner: Mask,
-    classes: NDArray[np.int32] | None,
-    first: int,
-    wanted: int,
-    body: bool,
-    s: LiftSettings,
+    near: Indices, inner: Mask, classes: NDArray[np.int32] | None, first: int, wanted: int, body: bool, s: LiftSettings
 ) -> Indices | None:
     """Returns the points `near` a box that are in it and of its class in the mask; None where these are too few.
 
@@ -229,12 +221,7 @@ def _of_class(
 
 
 def _body(
-    seen: Seen,
-    columns: Array,
-    lines: Array,
-    own: Mask,
-    box: tuple[float, float, float, float],
-    s: LiftSettings,
+    seen: Seen, columns: Array, lines: Array, own: Mask, box: tuple[float, float, float, float], s: LiftSettings
 ) -> tuple[Indices, float] | None:
     """Returns the points of the body that a box is around, and the share of its mask in the box that they are.
 
@@ -327,12 +314,7 @@ def _object(
 
 
 def _best(
-    seen: Seen,
-    parts: Sequence[_Part],
-    box: tuple[float, float, float, float],
-    s: LiftSettings,
-    *,
-    masked: bool,
+    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
 ) -> tuple[_Part, float]:
     """Returns the part, grown by others near it, that is the object of a box, and the overlap of its image with it.
 
@@ -401,9 +383,7 @@ def _linked(places: Array, reach: float) -> NDArray[np.intp]:
     """Returns the group of each place (N, 3): those within reach of each other, directly or by others, are one."""
     count = len(places)
     if count > _DENSE:
-        pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
-        graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
-        return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+        return connected(cKDTree(places).query_pairs(reach, output_type="ndarray"), count).astype(np.intp)
     square = np.einsum("ij,ij->i", places, places)
     linked = square[:, None] + square[None, :] - 2 * (places @ places.T) <= reach * reach
     linked.ravel()[:: count + 1] = True

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.matching import Observation
 from operators.scene.map.range_view import RangeView
+from operators.scene.map.voxels import VoxelSet
 
 Array = NDArray[np.float64]
 
@@ -23,11 +23,11 @@ _AWAY = 0.12  # metres from its place, from which a thing is carried
 
 def carried(
     seen: Sequence[Observation],
-    cells: Sequence[Cells],
+    voxels: Sequence[VoxelSet],
     joined: Mapping[int, int],
     view: RangeView,
     objects: Mapping[int, MapObject],
-    kinds: Kinds,
+    priors: ClassPriors,
     views: int,
 ) -> dict[int, int]:
     """Returns the id of the carried object for each observation of an object in a person's hand.
@@ -35,19 +35,19 @@ def carried(
     `joined` holds the object's ids of the other observations, `views` in how many views a thing must
     have been seen. Notes with the things whether they are held now.
     """
-    free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in kinds.portable]
-    hands = [objects[i] for k, i in joined.items() if seen[k].class_id in kinds.carriers]
+    free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in priors.portable]
+    hands = [objects[i] for k, i in joined.items() if seen[k].class_id in priors.carriers]
     if not free or not (hands or any(o.held for o in objects.values())):
         return {}
     there = set(joined.values())
     rest = [o for i, o in sorted(objects.items()) if i not in there]
-    things = [o for o in rest if o.class_id in kinds.portable and o.sightings >= views]
+    things = [o for o in rest if o.class_id in priors.portable and o.sightings >= views]
     shown = view.may_show(np.array([o.center for o in things]).reshape(-1, 3), np.zeros(len(things)))
     usable = [o.id for o, plain in zip(things, shown.tolist(), strict=True) if plain]
     found: dict[int, int] = {}
     for k in free:
-        id = taken(cells[k].middle, seen[k].class_id, objects, usable)
-        held = in_hand(cells[k].middle, hands)
+        id = taken(voxels[k].middle, seen[k].class_id, objects, usable)
+        held = in_hand(voxels[k].middle, hands)
         if id is not None and (held or objects[id].held):  # what was in a hand may be put anywhere in reach
             found[k] = id
             objects[id].held = held

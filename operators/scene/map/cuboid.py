@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
 from operators.estimation.kernels import huber
 from operators.labels import SizePrior
-from operators.scene.map.box_images import CORNERS, ELLIPSE, images
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Box = tuple[Array, Array, float]
 """Centre (3,), full size (3,) and heading about the vertical of an upright box."""
 
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_AROUND = np.radians(22.5 + 45 * np.arange(8))
+ELLIPSE = np.array([[0.52 * np.cos(a), 0.52 * np.sin(a), z] for a in _AROUND for z in (-0.5, 0.5)])
+_NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
 _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
@@ -52,9 +56,89 @@ class ImageView:
     def moved(self, T: Array) -> ImageView:
         """Returns the view after a rigid motion (4, 4) of the camera and what it shows."""
         R, t = T[:3, :3], T[:3, 3]
-        back = np.eye(4)
-        back[:3, :3], back[:3, 3] = R.T, -R.T @ t
-        return replace(self, P=self.P @ back, eye=R @ self.eye + t, points=self.points @ R.T + t)
+        return replace(self, P=self.P @ invert(T), eye=R @ self.eye + t, points=self.points @ R.T + t)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """Ways (A,) in which a thing may stand: boxes (A, 7), centre, log sizes and heading, and what is expected of each.
+
+    Those whose number in `forms` is below the number of usual forms lie along the points, the others along the room.
+    `headings` with `turns` and `logs` with `spreads` are the expected headings and log sizes with their spreads,
+    `askew` is the cost of lying otherwise than most things around.
+    """
+
+    x: Array
+    forms: NDArray[np.intp]
+    headings: Array
+    turns: Array
+    logs: Array
+    spreads: Array
+    askew: Array
+
+    @classmethod
+    def of(
+        cls,
+        start: Box,
+        points: Array,
+        eyes: Array,
+        usual: Sequence[SizePrior],
+        before: tuple[int, Box] | None,
+        heading: float | None,
+    ) -> _Ways:
+        """Returns the ways to try, or that of a settled result; arguments as of `fit_cuboid`, `eyes` (V, 3)."""
+        logs, spreads, along = _priors(tuple(usual))
+        count = len(logs)
+        if before is None:
+            x, forms = _starts(start, eyes, logs), np.arange(count)
+            if heading is not None:
+                turned = _nearest_turn(start[2], heading)
+                x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
+                forms = np.concatenate([forms[~along], forms + count])
+                x = x[forms]
+            headings = x[:, 6].copy()
+        else:
+            form, box = before
+            form += count if heading is not None and form < count and along[form] else 0  # settled before it was known
+            forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
+            towards = heading if heading is not None and form >= count else start[2]
+            headings = np.array([_nearest_turn(box[2], towards)])
+        own = forms % count
+        turns = np.where(along[own] & (forms >= count), _TURN_ALONG, _TURN)
+        askew = np.where((forms < count) & (heading is not None), _ASKEW, 0.0)
+        return cls(x, forms, headings, turns, logs[own], spreads[own], askew)
+
+    def chosen(self, rows: NDArray[np.intp]) -> _Ways:
+        return _Ways(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """Evidence for a box: the image boxes (V, 4) of views `P` (3, V, 4) with their weights, and points.
+
+    `places` (3, N) are `count` points, then the eyes; `cut`, `noise` and `inset` as `_surface` takes them.
+    """
+
+    P: Array
+    boxes: Array
+    weights: Array
+    outline: Array
+    places: Array
+    count: int
+    cut: int
+    noise: float
+    inset: float
+
+    def residuals(self, rows: Array, ways: _Ways) -> Array:
+        """Returns the residuals (A, K, R) of boxes (A, K, 7), some for each way."""
+        flat = rows.reshape(-1, 7)
+        image = images(flat, self.P, self.outline) - self.boxes
+        image = (image * self.weights).reshape(len(flat), -1)
+        image[np.isnan(image)] = 0.0
+        turn = ((rows[..., 6] - ways.headings[:, None]) / ways.turns[:, None]).reshape(-1, 1)
+        size = ((rows[..., 3:6] - ways.logs[:, None]) / ways.spreads[:, None]).reshape(-1, 3)
+        surface = _surface(flat, self.places, self.count, self.cut, self.noise, self.inset)
+        return np.concatenate([image, surface, turn, size], axis=1).reshape(*rows.shape[:2], -1)
 
 
 def fit_cuboid(
@@ -80,64 +164,44 @@ def fit_cuboid(
     `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    logs, spreads, along = _priors(tuple(usual))
-    ways = len(logs)
-    eyes = np.stack([v.eye for v in views])
-    if before is None:
-        x, forms = _starts(start, eyes, logs), np.arange(ways)
-        if heading is not None:
-            turned = _nearest_turn(start[2], heading)
-            x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
-            forms = np.concatenate([forms[~along], forms + ways])
-            x = x[forms]
-        headings = x[:, 6].copy()
-    else:
-        form, box = before
-        form += ways if heading is not None and form < ways and along[form] else 0  # it settled before that was known
-        forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
-        headings = np.array([_nearest_turn(box[2], heading if heading is not None and form >= ways else start[2])])
-    logs, spreads = logs[forms % ways], spreads[forms % ways]
-    turns = np.where(along[forms % ways] & (forms >= ways), _TURN_ALONG, _TURN)
-    outline = ELLIPSE if usual and usual[0].round else CORNERS
-    inset = usual[0].inset if usual else 0.0
-    noise *= (_TAIL_ROUND if outline is ELLIPSE else _TAIL_FLAT) if raw else _TAIL
-    cut = int(len(points) * (_STRAYING_RAW if raw else _STRAYING))
-    P = np.stack([v.P for v in views], axis=1)
-    places = np.concatenate([points, eyes]).T.copy()
-    boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
-    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    weights = edges / (_stray(P) + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
-
-    def residuals(rows: Array) -> Array:
-        """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
-        flat = rows.reshape(-1, 7)
-        image = images(flat, P, outline) - boxes
-        image = (image * weights).reshape(len(flat), -1)
-        image[np.isnan(image)] = 0.0
-        turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
-        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
-        parts = [image, _surface(flat, places, len(points), cut, noise, inset), turn, size]
-        return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
-
-    askew = np.where((forms < ways) & (heading is not None), _ASKEW, 0.0)
+    ways = _Ways.of(start, points, np.stack([v.eye for v in views]), usual, before, heading)
+    evidence, edges, alike = _evidence(views, points, usual, noise, raw=raw)
     for turn in range(_ROUNDS if before is None else 2):
-        values = residuals(x[:, None] + _PROBES)
+        values = evidence.residuals(ways.x[:, None] + _PROBES, ways)
         r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
-        if turn == _CHOICE and len(x) > 1:
-            kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
-            x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
-            forms, askew, turns = forms[kept], askew[kept], turns[kept]
+        if turn == _CHOICE and len(ways.x) > 1:
+            kept = np.argsort(_cost(r) + ways.askew, kind="stable")[:2]
+            ways, r, J = ways.chosen(kept), r[kept], J[kept]
         weighted = J * _influence(r)[:, None]
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
-        x = x + step
+        ways = replace(ways, x=ways.x + step)
         if (np.abs(step) < 0.1 * _STEPS).all():
             break
-    last = residuals(x[:, None])[:, 0]
-    best = int(np.argmin(_cost(last) + askew))
-    off = np.abs(last[best, : 4 * len(views)]).reshape(-1, 2, 2).sum(axis=1) * np.sqrt(max(1.0, len(views) / _ALIKE))
+    last = evidence.residuals(ways.x[:, None], ways)[:, 0]
+    best = int(np.argmin(_cost(last) + ways.askew))
+    off = np.abs(last[best, : 4 * len(views)]).reshape(-1, 2, 2).sum(axis=1) * alike
     strays = off.max(axis=1) / np.maximum(edges.reshape(-1, 2, 2).sum(axis=1).max(axis=1), 1)
-    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6])), strays
+    x = ways.x[best]
+    return int(ways.forms[best]), (x[:3].copy(), np.exp(x[3:6]), float(x[6])), strays
+
+
+def _evidence(
+    views: Sequence[ImageView], points: Array, usual: Sequence[SizePrior], noise: float, *, raw: bool
+) -> tuple[_Evidence, Mask, float]:
+    """Returns what views and points show of a thing, which edges of the views count (V, 4), and for how many views of
+    the same error each one stands, as the square root."""
+    outline = ELLIPSE if usual and usual[0].round else CORNERS
+    noise *= (_TAIL_ROUND if outline is ELLIPSE else _TAIL_FLAT) if raw else _TAIL
+    cut = int(len(points) * (_STRAYING_RAW if raw else _STRAYING))
+    P = np.stack([v.P for v in views], axis=1)
+    places = np.concatenate([points, np.stack([v.eye for v in views])]).T.copy()
+    boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
+    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    alike = float(np.sqrt(max(1.0, len(views) / _ALIKE)))
+    weights = edges / (_stray(P) + _SHARE * sides) / alike
+    inset = usual[0].inset if usual else 0.0
+    return _Evidence(P, boxes, weights, outline, places, len(points), cut, noise, inset), edges, alike
 
 
 def _cost(r: Array) -> Array:
@@ -243,3 +307,39 @@ def _extents(values: Array, cut: int) -> tuple[Array, Array]:
     last = values.shape[2] - 1 - cut
     ranked = np.partition(values, (cut, last), axis=2)
     return ranked[..., cut], ranked[..., last]
+
+
+def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
+    """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind.
+
+    `rounded` (K,) marks boxes of objects with a round outline.
+    """
+    rows = boxes.copy()
+    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
+    image = images(rows, P[:, None], CORNERS)[:, 0]
+    if rounded.any():
+        image[rounded] = images(rows[rounded], P[:, None], ELLIPSE)[:, 0]
+    return image
+
+
+def images(rows: Array, P: Array, outline: Array) -> Array:
+    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (3, V, 4), NaN where partly behind the camera.
+
+    Boxes are centre, log sizes and heading. `outline` (C, 3) are the places in a box of side 1 that are looked at: the
+    first axis of what is worked with, along which extremes are found many times as fast.
+    """
+    c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+    x, y, z = outline.T[..., None] * np.exp(rows.T[3:6, None])
+    places = np.empty((3, len(outline), len(rows)))
+    np.subtract(c * x, s * y, out=places[0])
+    np.add(s * x, c * y, out=places[1])
+    places[2] = z
+    places += rows.T[:3, None]
+    seen = places.reshape(3, -1).T @ P[..., :3].reshape(-1, 3).T
+    seen += P[..., 3].ravel()
+    seen = seen.reshape(len(outline), len(rows), 3, -1)
+    depth = np.maximum(seen[:, :, 2], 1e-6)
+    uv = seen[:, :, :2] / depth[:, :, None]
+    image = np.concatenate([np.minimum.reduce(uv, axis=0), np.maximum.reduce(uv, axis=0)], axis=1).transpose(0, 2, 1)
+    image[np.minimum.reduce(depth, axis=0) < _NEAREST] = np.nan
+    return image

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.labels import SizePrior
-from operators.scene.map.cells import Cells, standing_box
 from operators.scene.map.cuboid import ImageView, fit_cuboid
 from operators.scene.map.trajectory import Correction
+from operators.scene.map.voxels import VoxelSet, standing_box
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class MapObject:
     """
 
     id: int
-    cells: Cells
+    voxels: VoxelSet
     votes: Array
     evidence: float
     born: int
@@ -144,7 +144,7 @@ class MapObject:
         heading: float | None = None,
         noise: float = 0.0,
         floor: float | None = None,
-        others: Sequence[Cells] = (),
+        others: Sequence[VoxelSet] = (),
     ) -> None:
         """Puts the box around what is surely the object's and not `others`', in agreement with its images and class.
 
@@ -152,7 +152,7 @@ class MapObject:
         over the `floor`, if that is known, selects among the usual forms of its class.
         """
         self.fresh = 0
-        sure = self.cells.sure(others)
+        sure = self.voxels.sure(others)
         if not len(sure):
             return
         sizes = [max(u.size) for u in usual.get(self.class_id, ())]
@@ -185,7 +185,7 @@ class MapObject:
         center, size, yaw = box
         c, s = math.cos(yaw), math.sin(yaw)
         axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        own = (self.cells.points - center) @ axes
+        own = (self.voxels.points - center) @ axes
         low, high = own.min(axis=0), own.max(axis=0)
         larger = np.maximum(size, high - low)
         shift = np.clip(0.0, high - larger / 2, low + larger / 2)
@@ -200,15 +200,15 @@ class MapObject:
 
     def correct(self, correction: Correction) -> None:
         """Moves each voxel and each image with the place from which it was seen; the box is to be fitted then."""
-        weights = self.cells.hits.sum()
-        T = correction.at(round(float(self.cells.hits @ self.cells.times / weights)) if weights else self.seen)
+        weights = self.voxels.hits.sum()
+        T = correction.at(round(float(self.voxels.hits @ self.voxels.times / weights)) if weights else self.seen)
         turn = T[:2, :2] @ np.array([math.cos(self.yaw), math.sin(self.yaw)])
-        self.cells.correct(correction)
+        self.voxels.correct(correction)
         self.yaw = math.atan2(float(turn[1]), float(turn[0]))
         self.center = T[:3, :3] @ self.center + T[:3, 3]
         self.velocity, self.view = T[:3, :3] @ self.velocity, T[:2, :2] @ self.view
         self.images = [image.moved(correction.at(image.stamp)) for image in self.images]
-        self.most = min(self.most, len(self.cells))
+        self.most = min(self.most, len(self.voxels))
 
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
@@ -217,7 +217,7 @@ class MapObject:
         images = [np.stack([getattr(v, name) for v in rows]) for name in ("P", "box", "edges", "eye")] if rows else []
         plain = {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)}
         beside = sorted(self.beside.items())
-        rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
+        rest = {"cells": self.voxels.snapshot(), "images": images, "beside": [list(each) for each in beside]}
         points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
         times = {"image_stamps": [v.stamp for v in rows]}
         return (
@@ -229,11 +229,11 @@ class MapObject:
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
-        cells = Cells(side)
-        cells.restore(state["cells"])
+        voxels = VoxelSet(side)
+        voxels.restore(state["cells"])
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
         plain = {"told": state["views"] * WHOLE, **state}  # earlier versions counted views alone
-        made = cls(cells=cells, **{name: plain[name] for name in _PLAIN}, **fields)
+        made = cls(voxels=voxels, **{name: plain[name] for name in _PLAIN}, **fields)
         made.beside = Counter({int(other): int(count) for other, count in state.get("beside", ())})
         made.held = bool(state.get("held", False))
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():

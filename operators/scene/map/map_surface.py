@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells, standing_box
 from operators.scene.map.trajectory import Correction
+from operators.scene.map.voxels import VoxelSet, standing_box
 from operators.scene.relations import TABLETOP
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class MapSurface:
 
     id: int
     label: str
-    cells: Cells
+    voxels: VoxelSet
     facing: Array
     evidence: float
     born: int
@@ -57,7 +57,7 @@ class MapSurface:
 
     def fit(self) -> None:
         """Fits the plane to the voxels, each as often as it was seen: level, or upright."""
-        weights, points = self.cells.hits / max(float(self.cells.hits.sum()), 1e-9), self.cells.points
+        weights, points = self.voxels.hits / max(float(self.voxels.hits.sum()), 1e-9), self.voxels.points
         self.middle = weights @ points
         if self.level:
             self.middle[2] = _median(points[:, 2], weights)
@@ -82,7 +82,7 @@ class MapSurface:
     def area(self) -> float:
         """Area that was seen of it, m²: that of the squares of the grid that hold points."""
         axes = np.array([[1.0, 0, 0], [0, 1, 0]]) if self.level else np.array([self._along, [0, 0, 1]])
-        column, row = np.floor((self.cells.points - self.middle) @ axes.T / SIDE).astype(np.int64).T
+        column, row = np.floor((self.voxels.points - self.middle) @ axes.T / SIDE).astype(np.int64).T
         return len(np.unique((column << 32) + row)) * SIDE * SIDE
 
     @property
@@ -102,8 +102,8 @@ class MapSurface:
         self.center, self.size, self.yaw = self._lying(heading) if self.level else self._standing()
 
     def _standing(self) -> tuple[Array, Array, float]:
-        ends = np.percentile((self.cells.points - self.middle) @ self._along, [_EDGE, 100 - _EDGE])
-        low, high = np.percentile(self.cells.points[:, 2], [_EDGE, 100 - _EDGE])
+        ends = np.percentile((self.voxels.points - self.middle) @ self._along, [_EDGE, 100 - _EDGE])
+        low, high = np.percentile(self.voxels.points[:, 2], [_EDGE, 100 - _EDGE])
         center = self.middle + self._along * ends.mean()
         center[2] = (low + high) / 2
         yaw = math.atan2(float(self._along[1]), float(self._along[0]))
@@ -111,10 +111,10 @@ class MapSurface:
 
     def _lying(self, heading: float | None) -> tuple[Array, Array, float]:
         if heading is None:
-            center, size, yaw = standing_box(self.cells.points)
+            center, size, yaw = standing_box(self.voxels.points)
         else:
             turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-            turned = self.cells.points[:, :2] @ turn
+            turned = self.voxels.points[:, :2] @ turn
             low, high = turned.min(axis=0), turned.max(axis=0)
             center, size, yaw = np.array([*(turn @ (low + high) / 2), 0.0]), np.array([*(high - low), 0.0]), heading
         center[2], size[2] = self.middle[2] - math.copysign(_THICKNESS / 2, float(self.facing[2])), _THICKNESS
@@ -122,34 +122,34 @@ class MapSurface:
 
     def take(self, other: MapSurface) -> None:
         """Takes in what was seen of a surface that is the same."""
-        self.cells.add(other.cells)
+        self.voxels.add(other.voxels)
         self.facing = self.facing + other.facing
         self.evidence = min(self.evidence + other.evidence, MOST_EVIDENCE)
         self.born, self.seen = min(self.born, other.born), max(self.seen, other.seen)
         self.views += other.views
-        self.most = max(self.most, len(self.cells))
+        self.most = max(self.most, len(self.voxels))
         self.fit()
 
     def correct(self, correction: Correction) -> None:
         """Moves each voxel with the place from which it was seen."""
-        if not len(self.cells):
+        if not len(self.voxels):
             return
-        self.facing = correction.at(round(float(self.cells.times.mean())))[:3, :3] @ self.facing
-        self.cells.correct(correction)
-        self.most = min(self.most, len(self.cells))
+        self.facing = correction.at(round(float(self.voxels.times.mean())))[:3, :3] @ self.facing
+        self.voxels.correct(correction)
+        self.most = min(self.most, len(self.voxels))
         self.fit()
 
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
 
     def snapshot(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)} | {"cells": self.cells.snapshot()}
+        return {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)} | {"cells": self.voxels.snapshot()}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any]) -> MapSurface:
-        cells = Cells(SIDE)
-        cells.restore(state["cells"])
+        voxels = VoxelSet(SIDE)
+        voxels.restore(state["cells"])
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
-        return cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
+        return cls(voxels=voxels, **{name: state[name] for name in _PLAIN}, **fields)
 
 
 def _median(values: Array, weights: Array) -> float:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.box_images import image_boxes
-from operators.scene.map.cells import Cells, standing_box
-from operators.scene.map.cuboid import ImageView
+from operators.scene.map.cuboid import ImageView, image_boxes
 from operators.scene.map.map_object import MapObject
+from operators.scene.map.voxels import VoxelSet, standing_box
 from operators.tracking.assignment import overlap
 
 Array = NDArray[np.float64]
+Pair = tuple[float, float]
 LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so that its voxels tell
 _COARSE = 0.3  # metres from which a thing is often hidden in part
 _WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
@@ -67,62 +67,56 @@ class Observation:
     track: int = -1
 
 
-def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, s: MapSettings) -> float:
+def alike_mover(each: Observation, voxels: VoxelSet, object: MapObject, stamp: int, s: MapSettings) -> float:
     """Returns how likely an observation is of a mover, by where that should be by now and its track; 0 for not."""
     if each.class_id != object.class_id:
         return 0.0
     since = (stamp - object.seen) * 1e-9
-    center, _, _ = standing_box(cells.points)
+    center, _, _ = standing_box(voxels.points)
     away = center - object.center - object.velocity * min(since, 1.0)
     reach = s.mover_reach + s.mover_speed * min(since, 2.0)
     near = 1 - float(np.hypot(away[0], away[1])) / reach
     return near + (_TRACKED if each.track in object.tracks else 0.0) if near > 0 else 0.0
 
 
-@dataclass(frozen=True)
-class InImage:
-    """An observation's image and that of an object's box: IoU, and the share of the first that is in the second."""
-
-    iou: float
-    within: float
-
-
 def alike(
-    each: Observation, cells: Cells, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
+    each: Observation, voxels: VoxelSet, object: MapObject, image: Pair | None, s: MapSettings, *, large: bool
 ) -> float:
     """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
-    `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
+    `image` has the IoU of its image with that of the object's box, and the share of the first that is in the second,
+    where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
-    away = outside(cells.middle, object.box)
-    reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
+    iou, within = (math.nan, math.nan) if image is None else image
+    away = outside(voxels.middle, object.box)
+    reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(voxels.middle - each.image.eye))
     if away > reach:
         return 0.0
     if each.class_id != object.class_id:
         if image is not None:
-            return 0.5 * image.iou if image.iou >= 0.6 else 0.0
-        if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
+            return 0.5 * iou if iou >= 0.6 else 0.0
+        if float(np.abs(object.size - voxels.extent).max()) > 0.5 * float(object.size.max()):
             return 0.0
-        share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
+        share = min(object.voxels.near(voxels.points, s.voxel), voxels.near(object.voxels.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
     value += _TRACKED if each.track in object.tracks else 0.0
-    if image is not None and image.iou >= s.image_overlap:
-        return value + 0.6 * image.iou
+    if iou >= s.image_overlap:
+        return value + 0.6 * iou
     if image is not None and not large:  # what is hidden in part shows in part of its box
-        return value + 0.2 * image.within if image.within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
-    share = object.cells.near(cells.points, tolerance(cells.extent))
+        return value + 0.2 * within if within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
+    share = object.voxels.near(voxels.points, tolerance(voxels.extent))
     if image is None and not large:
-        value *= closeness(cells, object.cells)
+        value *= closeness(voxels, object.voxels)
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
-def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
+def in_reach(seen: Sequence[Observation], voxels: Sequence[VoxelSet], rows: Array, s: MapSettings) -> NDArray[np.bool_]:
     """Returns which of the observations (N) are near enough to boxes (M, 7), centre, size, heading, to be `alike`.
 
     A micrometre more passes: `alike` decides.
     """
-    middles = np.array([each.middle for each in cells])
+    middles = np.array([each.middle for each in voxels])
     eyes = [middle if each.image is None else each.image.eye for each, middle in zip(seen, middles, strict=True)]
     reach = s.reach + _SLACK * np.sqrt(np.square(middles - np.array(eyes)).sum(axis=1))
     x, y, z = middles.T[..., None] - rows.T[:3, None]
@@ -132,20 +126,9 @@ def in_reach(seen: Sequence[Observation], cells: Sequence[Cells], rows: Array, s
     return np.asarray((gaps * gaps).sum(axis=0) <= np.square(reach + 1e-6)[:, None])
 
 
-@dataclass(frozen=True, eq=False)
-class InImages:
-    """The same of each observation (N) and object (M): `iou` and `within` (N, M)."""
-
-    iou: Array
-    within: Array
-
-    def of(self, observation: int, object: int) -> InImage:
-        """Compares one of each."""
-        return InImage(float(self.iou[observation, object]), float(self.within[observation, object]))
-
-
-def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
-    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any."""
+def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> Array | None:
+    """Returns the IoUs of the images of observations (N) and boxes (M, 7), some of round things, and the shares of the
+    first in the second (N, M, 2); None without images."""
     if not len(rows) or any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
@@ -160,7 +143,7 @@ def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
     areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)
     within = np.nan_to_num(np.maximum(high - low, 0).prod(axis=2) / areas[:, None])
-    return InImages(iou, within)
+    return np.stack([iou, within], axis=2)
 
 
 def in_places_of_their_own(images: Sequence[ImageView]) -> NDArray[np.bool_]:
@@ -187,12 +170,12 @@ def tolerance(extent: Array) -> float:
     return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
 
 
-def closeness(cells: Cells, known: Cells) -> float:
+def closeness(voxels: VoxelSet, known: VoxelSet) -> float:
     """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
-    extent = np.sort(cells.extent)
+    extent = np.sort(voxels.extent)
     if extent[2] > 0.4:
         return 0.5
-    away = float(np.linalg.norm(cells.middle - known.middle))
+    away = float(np.linalg.norm(voxels.middle - known.middle))
     return max(0.0, 1 - away / (max(float(extent[1]), 0.03) + 0.02))
 
 

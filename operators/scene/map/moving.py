@@ -19,7 +19,6 @@ _EVERY, _AGO, _LONG_AGO = 0.3, 0.6, 2.0  # seconds between the views kept, and h
 _MOVED = 0.4  # share of a place that is seen through now, or was before, of what is seen of it
 _STEEP = 2.0  # of the probability by that share
 _UNSURE = 0.1  # of the probability, off 0.5: knowledge fades to it before the centre counts
-_SEEN = 0.2  # share of the voxels looked at that must show either, for a place to tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class RecentPlaces:
             each.moving = told if not each.moving >= 0 else (each.moving + told) / 2
         self._moments = [m for m in kept if before is None or m.stamp >= before.stamp]
         if movers and (not kept or stamp - kept[-1].stamp >= _EVERY * 1e9):
-            self._moments.append(_Moment(stamp, view, {o.id: o.cells.points for o in movers}))
+            self._moments.append(_Moment(stamp, view, {o.id: o.voxels.points for o in movers}))
 
     def forget(self) -> None:
         """Forgets the views: they are not where they were any more."""
@@ -80,21 +79,16 @@ def _moved(object: MapObject, before: _Moment, view: RangeView, margin: float) -
 
     0.5 where its places are hidden in the views, NaN where neither looks at them.
     """
-    sights = [before.view.of(object.cells.points, margin)]
+    sights = [before.view.of(object.voxels.points, margin)]
     if object.id in before.places:
         sights.append(view.of(before.places[object.id], margin))
     shares = [share for share in map(_seen_through, sights) if share is not None]
     if not shares:
-        return 0.5 if any(np.count_nonzero(sight.looked) >= _least(sight) for sight in sights) else math.nan
+        return 0.5 if any(np.count_nonzero(sight.looked) >= sight.least for sight in sights) else math.nan
     return min(max(0.5 + _STEEP * (max(shares) - _MOVED), 0.02), 0.98)
 
 
 def _seen_through(sight: Sight) -> float | None:
     """Returns the share of a place that is seen through, of what is seen of it; None where too little is."""
     free, taken = int(np.count_nonzero(sight.free)), int(np.count_nonzero(sight.confirmed))
-    return None if free + taken < _least(sight) else free / (free + taken)
-
-
-def _least(sight: Sight) -> float:
-    """Returns how many voxels must be seen for a place to tell."""
-    return max(5.0, _SEEN * len(sight.looked))
+    return None if free + taken < sight.least else free / (free + taken)

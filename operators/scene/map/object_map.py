@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.map.carrying import carried
-from operators.scene.map.cells import Cells
+from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.heading import RoomHeading
-from operators.scene.map.kinds import Kinds
 from operators.scene.map.map_object import MOST_EVIDENCE, WHOLE, MapObject
 from operators.scene.map.matching import (
     MapSettings,
@@ -31,7 +29,8 @@ from operators.scene.map.moving import RecentPlaces
 from operators.scene.map.presence import has_left, look_at
 from operators.scene.map.range_view import RangeView
 from operators.scene.map.trajectory import Correction
-from operators.tracking.assignment import assign
+from operators.scene.map.voxels import VoxelSet
+from operators.tracking.assignment import assign, log_odds
 
 Array = NDArray[np.float64]
 _GONE = 1.0  # times its size away from its place, and a thing is moved
@@ -53,8 +52,8 @@ class ObjectMap:
     After Hughes et al., "Hydra", 2022, and Gu et al., "ConceptGraphs", 2024; existence as in occupancy grids.
     """
 
-    def __init__(self, classes: int, kinds: Kinds, settings: MapSettings) -> None:
-        self._settings, self._classes, self._kinds = settings, classes, kinds
+    def __init__(self, classes: int, priors: ClassPriors, settings: MapSettings) -> None:
+        self._settings, self._classes, self._priors = settings, classes, priors
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -79,23 +78,23 @@ class ObjectMap:
         self._updates += 1
         self._heading = self._room.angle
         seen = [self._alone(each, view) for each in seen]
-        cells = Cells.of_each([each.points for each in seen], s.voxel, stamp)
-        joined = self._joined(seen, cells, stamp, view)
+        voxels = VoxelSet.of_each([each.points for each in seen], s.voxel, stamp)
+        joined = self._joined(seen, voxels, stamp, view)
         ids: dict[int, int] = {}
-        in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
+        in_hands = carried(seen, voxels, joined, view, self.objects, self._priors, s.views)
         for k, each in enumerate(seen):
             if k in in_hands:
-                self._see(self.objects[in_hands[k]], each, cells[k], stamp, view.origin, moved=True)
+                self._see(self.objects[in_hands[k]], each, voxels[k], stamp, view.origin, moved=True)
                 joined[k] = in_hands[k]
             elif k in joined:
-                self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
+                self._see(self.objects[joined[k]], each, voxels[k], stamp, view.origin)
             else:
-                ids[k] = self._begin(each, cells[k], stamp, view.origin)
+                ids[k] = self._begin(each, voxels[k], stamp, view.origin)
             if each.track >= 0:
                 self.objects[joined[k] if k in joined else ids[k]].follow([each.track])
-        movers = [o for o in self.objects.values() if o.seen == stamp and self._kinds.is_mover(o)]
-        self._recent.judge(stamp, [o for o in movers if self._kinds.is_large(o)], view)
-        shown = {i: cells[k] for k, i in joined.items()}
+        movers = [o for o in self.objects.values() if o.seen == stamp and self._priors.is_mover(o)]
+        self._recent.judge(stamp, [o for o in movers if self._priors.is_large(o)], view)
+        shown = {i: voxels[k] for k, i in joined.items()}
         self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
@@ -119,9 +118,9 @@ class ObjectMap:
         """Heading of most things around, in [0, pi / 2); None where none stands out."""
         return self._heading
 
-    def widen(self, classes: int, kinds: Kinds) -> None:
+    def widen(self, classes: int, priors: ClassPriors) -> None:
         """Takes in classes that were added after those before."""
-        self._classes, self._kinds = classes, kinds
+        self._classes, self._priors = classes, priors
         for object in (*self.objects.values(), *(old for _, old in self.gone.values())):
             object.votes = np.pad(object.votes, (0, classes - len(object.votes)))
 
@@ -131,15 +130,15 @@ class ObjectMap:
 
     def doubt(self, object: MapObject) -> float:
         """Returns the share of an object's existence that its size or a weak label puts in doubt, in [0, 1)."""
-        return self._kinds.doubt(object, self._settings.label)
+        return self._priors.doubt(object, self._settings.label)
 
     def _alone(self, each: Observation, view: RangeView) -> Observation:
         """Returns an observation without what is behind the thing."""
-        points = self._kinds.near_side(each.points, each.class_id, view.origin, self._settings.range_noise)
+        points = self._priors.near_side(each.points, each.class_id, view.origin, self._settings.range_noise)
         return replace(each, points=points)
 
     def _joined(
-        self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
+        self, seen: Sequence[Observation], voxels: Sequence[VoxelSet], stamp: int, view: RangeView
     ) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
         s, ids = self._settings, sorted(self.objects)
@@ -148,20 +147,20 @@ class ObjectMap:
             return {}
         known = [self.objects[i] for i in ids]
         centers, sizes = np.array([o.center for o in known]), np.array([o.size for o in known])
-        moves = np.array([self._kinds.is_mover(o) for o in known])
-        still = np.array([self._kinds.is_still(o) for o in known])
+        moves = np.array([self._priors.is_mover(o) for o in known])
+        still = np.array([self._priors.is_still(o) for o in known])
         classes = np.array([o.class_id for o in known])
-        movers = np.array([each.class_id in self._kinds.movers for each in seen])
-        halves = np.array([[float(c.extent.max()) / 2] for c in cells]) + np.linalg.norm(sizes, axis=1) / 2
-        near = np.linalg.norm(centers[None] - np.array([c.middle for c in cells])[:, None], axis=2) - halves
+        movers = np.array([each.class_id in self._priors.movers for each in seen])
+        halves = np.array([[float(c.extent.max()) / 2] for c in voxels]) + np.linalg.norm(sizes, axis=1) / 2
+        near = np.linalg.norm(centers[None] - np.array([c.middle for c in voxels])[:, None], axis=2) - halves
         here = ~moves & (near <= s.reach) & (still | ~movers[:, None])
         compared = np.flatnonzero(here.any(axis=0)).tolist()
         boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
         near_by = [known[j] for j in compared]
-        images = in_image(seen, boxes, np.array([self._kinds.is_round(o) for o in near_by], bool))
-        for k, n in np.argwhere(here[:, compared] & in_reach(seen, cells, boxes, s)).tolist():
-            j, image = compared[n], None if images is None else images.of(k, n)
-            value[k, j] = alike(seen[k], cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
+        images = in_image(seen, boxes, np.array([self._priors.is_round(o) for o in near_by], bool))
+        for k, n in np.argwhere(here[:, compared] & in_reach(seen, voxels, boxes, s)).tolist():
+            j, image = compared[n], None if images is None else (float(images[k, n, 0]), float(images[k, n, 1]))
+            value[k, j] = alike(seen[k], voxels[k], known[j], image, s, large=self._priors.is_large(known[j]))
         left: dict[int, bool] = {}
         for k in np.flatnonzero(movers).tolist():
             each = seen[k]
@@ -170,17 +169,17 @@ class ObjectMap:
                 if not moves[j] and j not in left:
                     left[j] = has_left(known[j], view, s)
                 if moves[j] or left[j]:
-                    value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
+                    value[k, j] = alike_mover(each, voxels[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _see(
-        self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array, *, moved: bool = False
+        self, object: MapObject, each: Observation, voxels: VoxelSet, stamp: int, eye: Array, *, moved: bool = False
     ) -> None:
-        mover = moved or self._kinds.is_mover(object)
-        gone = outside(cells.middle, object.box) > _GONE * float(object.size.max())
-        if moved or (each.class_id in self._kinds.movers and gone):
+        mover = moved or self._priors.is_mover(object)
+        gone = outside(voxels.middle, object.box) > _GONE * float(object.size.max())
+        if moved or (each.class_id in self._priors.movers and gone):
             mover, object.images, object.form = True, [], -1  # what lay still is moved
-        direction = _direction(eye, cells)
+        direction = _direction(eye, voxels)
         object.views += 1
         object.view = direction * object.views if mover else object.view + direction
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
@@ -188,7 +187,7 @@ class ObjectMap:
         object.vote(each.class_id, each.score)
         told = min(stamp - object.seen, WHOLE)
         object.told += told
-        gain = told / WHOLE * _log_odds(each.score, self._settings.gain)
+        gain = told / WHOLE * log_odds(each.score, self._settings.gain)
         object.evidence = min(max(object.evidence, 0.0) + gain, MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
@@ -196,7 +195,7 @@ class ObjectMap:
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
             earlier = object.box
-            object.cells, object.most = cells, len(cells)
+            object.voxels, object.most = voxels, len(voxels)
             self._fit(object)
             if each.image is not None and not each.image.edges.all() and not moved:
                 object.keep(earlier)
@@ -204,42 +203,42 @@ class ObjectMap:
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
             return
-        object.cells.add(cells)
+        object.voxels.add(voxels)
         object.velocity = np.zeros(3)
         image = each.image
-        new = image is not None and object.look(image, cells.points) and len(object.images) not in (2, 4)
+        new = image is not None and object.look(image, voxels.points) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
             self._fit(object)
 
     def _fit(self, object: MapObject) -> None:
-        s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
-        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others)
-        if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
+        s, others = self._settings, smaller_in_place(object, self.objects.values(), self._priors, self._settings)
+        object.fit(self._priors.usual, self._heading, s.range_noise, self.floor, others)
+        if self.floor is not None and (foot := self._priors.foot(object)) > 0:
             object.stand_on(self.floor, foot)
 
     def _is_sure(self, object: MapObject) -> bool:
         return object.evidence >= self._settings.confirm and object.sightings >= self._settings.views
 
-    def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> int:
+    def _begin(self, each: Observation, voxels: VoxelSet, stamp: int, eye: Array) -> int:
         votes = np.zeros(self._classes)
         votes[each.class_id] = each.score
-        made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
+        made = MapObject(self._next, voxels, votes, log_odds(each.score, self._settings.gain), stamp, stamp)
         if each.color is not None:
             made.color = each.color
-        made.view = _direction(eye, cells)
-        made.center = cells.middle
+        made.view = _direction(eye, voxels)
+        made.center = voxels.middle
         image = each.image
         self._fit(made)  # to its points: a single image is weaker evidence, and counts from the next fit on
-        if image is not None and not self._kinds.is_mover(made):
-            made.look(image, cells.points)
+        if image is not None and not self._priors.is_mover(made):
+            made.look(image, voxels.points)
         self.objects[made.id] = made
         self._next += 1
         return made.id
 
     def _look_around(
-        self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, Cells], seconds: float
+        self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, VoxelSet], seconds: float
     ) -> None:
         """Updates objects by what a view shows at their places; `shown` are the voxels of visible ones, by id."""
         s = self._settings
@@ -247,11 +246,11 @@ class ObjectMap:
             return
         centers, radii = np.array([o.center for o in objects]), np.array([o.longest for o in objects])
         near = [objects[k] for k in np.flatnonzero(view.may_show(centers, radii + s.margin)).tolist()]
-        sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
+        sights = dict(zip((o.id for o in near), view.of_each([o.voxels.points for o in near], s.margin), strict=True))
         for object in objects:
             sight, own = sights.get(object.id), shown.get(object.id)
-            left = own is None and sight is not None and self._kinds.may_leave(object) and has_left(object, view, s)
-            look_at(object, sight, view.origin, own, seconds, self._kinds, s, left=left)
+            left = own is None and sight is not None and self._priors.may_leave(object) and has_left(object, view, s)
+            look_at(object, sight, view.origin, own, seconds, self._priors, s, left=left)
 
     def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
         """Counts for neighbours the views in which both were seen, in separate places in the image."""
@@ -276,7 +275,7 @@ class ObjectMap:
         rows = np.searchsorted(ids, changed)
         apart = np.linalg.norm(centers[None] - centers[rows, None], axis=2)
         close = apart <= (radii[None] + radii[rows, None]) / 2 + 0.1
-        touch = may_be_one(known, rows, self._kinds)
+        touch = may_be_one(known, rows, self._priors)
         joined = False  # then what touches has changed
         for (k, n), touches in zip(np.argwhere(close).tolist(), touch[close].tolist(), strict=True):
             if not (joined or touches):
@@ -285,9 +284,9 @@ class ObjectMap:
             if i not in self.objects or j not in self.objects or i == j:
                 continue
             a, b = self.objects[i], self.objects[j]
-            if are_one(a, b, self._kinds, self._settings.voxel):
+            if are_one(a, b, self._priors, self._settings.voxel):
                 del self.objects[i], self.objects[j]
-                one = merge(a, b, self._kinds)
+                one = merge(a, b, self._priors)
                 self._fit(one)
                 self.objects[one.id] = one
                 joined = True
@@ -349,15 +348,10 @@ class ObjectMap:
             self.gone[old.id] = (int(stamp), old)
 
 
-def _direction(eye: Array, cells: Cells) -> Array:
+def _direction(eye: Array, voxels: VoxelSet) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""
-    way = (cells.middle - eye)[:2]
+    way = (voxels.middle - eye)[:2]
     return np.asarray(way / max(float(np.hypot(*way)), 1e-6))
-
-
-def _log_odds(score: float, least: float) -> float:
-    bounded = min(max(score, 0.02), 0.95)
-    return max(math.log(bounded / (1 - bounded)), least)
 
 
 def _moved(old: MapObject, new: MapObject) -> bool:

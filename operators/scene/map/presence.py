@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.map_object import MOST_EVIDENCE, WHOLE, MapObject
 from operators.scene.map.matching import MapSettings
-from operators.scene.map.range_view import GROWTH, RangeView, Sight
+from operators.scene.map.range_view import EMPTY, GROWTH, RangeView, Sight
+from operators.scene.map.voxels import VoxelSet
 
 Array = NDArray[np.float64]
 
 _SELDOM = 3  # one view in so many is used to remove voxels of other objects
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
-_EMPTY = 0.6  # share of the voxels looked at that are seen through, from which a place is empty
 _STRAY, _NOISES = 0.03, 3.0  # metres, and standard deviations of ranges, by which voxels stray from a surface
 
 
@@ -26,16 +25,16 @@ def has_left(object: MapObject, view: RangeView, s: MapSettings) -> bool:
     """
     away = float(np.linalg.norm(object.center - view.origin))
     margin = min(s.margin + GROWTH * away, _STRAY + _NOISES * s.range_noise * away * away)
-    return _is_empty(view.of(object.cells.points, margin, 0.0))
+    return view.of(object.voxels.points, margin, 0.0).is_empty
 
 
 def look_at(
     object: MapObject,
     sight: Sight | None,
     eye: Array,
-    own: Cells | None,
+    own: VoxelSet | None,
     seconds: float,
-    kinds: Kinds,
+    priors: ClassPriors,
     s: MapSettings,
     *,
     left: bool,
@@ -45,38 +44,28 @@ def look_at(
     `seconds` is the time since the view before: a view soon after it weighs less. `left` marks an object whose place a
     finer look found empty.
     """
-    mover = kinds.is_mover(object)
-    if not len(object.cells):
+    mover = priors.is_mover(object)
+    if not len(object.voxels):
         object.evidence = -1.0
         return
     if not mover and sight is not None:
         if own is not None and object.views % _SELDOM == 0:
-            object.cells.doubt(sight.confirmed, own, _SELDOM)
-        object.cells.carve(sight.free)
-        object.most = max(object.most, len(object.cells))
+            object.voxels.doubt(sight.confirmed, own, _SELDOM)
+        object.voxels.carve(sight.free)
+        object.most = max(object.most, len(object.voxels))
     if own is not None:
         return
-    if len(object.cells) < _LEFT * object.most:
+    if len(object.voxels) < _LEFT * object.most:
         object.evidence = -1.0
     if mover:
         object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
     if sight is None:
         return
     share = min(seconds * 1e9 / WHOLE, 1.0)
-    if left or _is_empty(sight):
+    if left or sight.is_empty:
         object.evidence -= share * s.vacated * (3 if mover else 1)
-    elif np.count_nonzero(sight.looked) >= _least(sight):
+    elif np.count_nonzero(sight.looked) >= sight.least:
         distance = float(np.linalg.norm(object.center - eye))
-        plain = np.count_nonzero(sight.confirmed) >= _EMPTY * len(sight.looked)
+        plain = np.count_nonzero(sight.confirmed) >= EMPTY * len(sight.looked)
         if plain and object.longest >= s.miss_angle * distance:
             object.evidence -= share * s.missed
-
-
-def _is_empty(sight: Sight) -> bool:
-    looked = int(np.count_nonzero(sight.looked))
-    return looked >= _least(sight) and int(np.count_nonzero(sight.free)) >= _EMPTY * looked
-
-
-def _least(sight: Sight) -> float:
-    """Returns how many voxels must be looked at for a view to tell."""
-    return max(5.0, 0.2 * len(sight.looked))

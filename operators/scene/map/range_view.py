@@ -16,6 +16,7 @@ Mask = NDArray[np.bool_]
 
 _FAR = 1 << 30
 GROWTH = 0.02  # share of the range by which the margin grows that is safe for all
+EMPTY = 0.6  # share of the places looked at, from which they are as a whole what these are
 _WIDER = 2.0  # columns narrow towards the poles: at 60 degrees to half
 
 
@@ -26,6 +27,17 @@ class Sight:
     looked: Mask
     free: Mask
     confirmed: Mask
+
+    @property
+    def least(self) -> float:
+        """Least number of places looked at from which a view decides."""
+        return max(5.0, 0.2 * len(self.looked))
+
+    @property
+    def is_empty(self) -> bool:
+        """True where enough places are looked at and most of these are seen through."""
+        looked = int(np.count_nonzero(self.looked))
+        return looked >= self.least and int(np.count_nonzero(self.free)) >= EMPTY * looked
 
 
 class RangeView:

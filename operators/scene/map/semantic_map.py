@@ -30,10 +30,10 @@ from operators.cloud.filtering import in_range
 from operators.geometry.depth_sensors import DEPTH_SENSOR, read_depth_sensor
 from operators.geometry.extrinsics import transform_between
 from operators.labels import LabelSpace, labels_file
-from operators.scene.known_classes import warn_of_unknown
+from operators.labels.label_space import warn_of_unknown
+from operators.scene.map.class_priors import ClassPriors
 from operators.scene.map.cuboid import ImageView
 from operators.scene.map.file import LearnedFile, SavedMap, learned_files, together
-from operators.scene.map.kinds import Kinds
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.matching import MapSettings, Observation
 from operators.scene.map.nodes import nodes_of, seen_surfaces
@@ -91,8 +91,7 @@ class SemanticMap(Operator):
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
     images: Sampled[Detections2D] = Sampled(
-        required=False,
-        doc="the image's boxes of the same objects, in their order; not used where of another stamp",
+        required=False, doc="the image's boxes of the same objects, in their order; not used where of another stamp"
     )
     image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
     surfaces: Sampled[Boxes3D] = Sampled(
@@ -250,7 +249,7 @@ class SemanticMap(Operator):
                 raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self.state.classes}")
             self.state.classes = boxes.class_names
             self.state.counts["unknown classes"] = warn_of_unknown(self, self._labels, self.state.classes)
-            self.state.map.widen(len(self.state.classes), Kinds.of(self._labels, self.state.classes))
+            self.state.map.widen(len(self.state.classes), ClassPriors.of(self._labels, self.state.classes))
         return self.state.map
 
     def _count(self, counts: Mapping[str, int]) -> None:
@@ -298,7 +297,7 @@ class SemanticMap(Operator):
             mover_memory=self.mover_memory,
             move_memory=self.move_memory,
         )
-        return ObjectMap(max(len(self.state.classes), 1), Kinds.of(self._labels, self.state.classes), settings)
+        return ObjectMap(max(len(self.state.classes), 1), ClassPriors.of(self._labels, self.state.classes), settings)
 
     def _observation(
         self,
@@ -326,7 +325,7 @@ class SemanticMap(Operator):
             class_ids=np.array([o.class_id for o in objects], np.int32),
             ids=np.array([o.id for o in objects], np.int64),
             velocities=np.array([o.velocity for o in objects]).reshape(-1, 3),
-            point_counts=np.array([len(o.cells) for o in objects], np.int64),
+            point_counts=np.array([len(o.voxels) for o in objects], np.int64),
         )
 
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.map.cells import Cells
 from operators.scene.map.map_surface import FLOOR, SIDE, MapSurface
 from operators.scene.map.range_view import RangeView
 from operators.scene.map.trajectory import Correction
+from operators.scene.map.voxels import VoxelSet
 
 Array = NDArray[np.float64]
 
@@ -60,9 +60,9 @@ class SurfaceMap:
         shown: list[int] = []
         for each in seen:
             part = MapSurface(
-                self._next, each.label, Cells.of(each.points, SIDE, stamp), each.facing, _GAIN, stamp, stamp
+                self._next, each.label, VoxelSet.of(each.points, SIDE, stamp), each.facing, _GAIN, stamp, stamp
             )
-            part.most = len(part.cells)
+            part.most = len(part.voxels)
             known = self._best(part)
             if known is None:
                 self.surfaces[part.id] = part
@@ -77,7 +77,7 @@ class SurfaceMap:
         self._look_around(view, set(shown))
         for i, surface in list(self.surfaces.items()):
             seldom = surface.views < self._views and stamp - surface.seen > _FORGOTTEN
-            if surface.evidence < 0 or seldom or not len(surface.cells):
+            if surface.evidence < 0 or seldom or not len(surface.voxels):
                 del self.surfaces[i]
         rows = [s for _, s in sorted(self.surfaces.items()) if s.views >= self._views]
         self.confirmed = [s for s in rows if s.area >= self._min_area]
@@ -115,18 +115,16 @@ class SurfaceMap:
     def _look_around(self, view: RangeView, shown: set[int]) -> None:
         """Takes voxels from surfaces that the view looks through, and evidence from those that it does not show."""
         others = [s for i, s in self.surfaces.items() if i not in shown and s.label != FLOOR]
-        sights = view.of_each([s.cells.points for s in others], _MARGIN)
+        sights = view.of_each([s.voxels.points for s in others], _MARGIN)
         for surface, sight in zip(others, sights, strict=True):
-            looked = int(np.count_nonzero(sight.looked))
-            if looked < max(5, 0.2 * len(sight.looked)):
+            if int(np.count_nonzero(sight.looked)) < sight.least:
                 continue
-            vacated = int(np.count_nonzero(sight.free)) >= 0.6 * looked
-            surface.cells.carve(sight.free)
-            if vacated:
+            surface.voxels.carve(sight.free)
+            if sight.is_empty:
                 surface.evidence -= _VACATED
-            if len(surface.cells) < _LEFT * surface.most:
+            if len(surface.voxels) < _LEFT * surface.most:
                 surface.evidence = -1.0
-            elif len(surface.cells):
+            elif len(surface.voxels):
                 surface.fit()
 
     # snapshot and restore are written out: saved maps hold what they give, and those of earlier versions are read
@@ -146,15 +144,15 @@ def shared(first: MapSurface, second: MapSurface) -> int:
     """Returns how many voxels of the smaller come near the other where both are one surface, else 0."""
     if first.label != second.label or float(first.normal @ second.normal) < _TURN:
         return 0
-    large, small = (first, second) if len(first.cells) >= len(second.cells) else (second, first)
+    large, small = (first, second) if len(first.voxels) >= len(second.voxels) else (second, first)
     limit = 2 * _AWAY if large.label == FLOOR else _AWAY
-    if not len(small.cells) or large.away(small.cells.points) > limit:
+    if not len(small.voxels) or large.away(small.voxels.points) > limit:
         return 0
     if large.label == FLOOR:
-        return len(small.cells)
+        return len(small.voxels)
     reach = _REACH[large.level]
-    if large.cells.apart(small.cells) > reach:
+    if large.voxels.apart(small.voxels) > reach:
         return 0
-    apart, _ = large.cells.tree().query(small.cells.points, distance_upper_bound=reach)
+    apart, _ = large.voxels.tree().query(small.voxels.points, distance_upper_bound=reach)
     near = int(np.count_nonzero(np.isfinite(apart)))
-    return near if near >= min(_TOUCHING, len(small.cells)) else 0
+    return near if near >= min(_TOUCHING, len(small.voxels)) else 0

@@ -23,14 +23,7 @@ from scipy.linalg import solve_triangular
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Remembered
 from operators.estimation.chi_square import quantile
-from operators.slam.landmarks.association import (
-    Association,
-    Density,
-    agreed_pairs,
-    jointly_compatible,
-    nearest,
-    tight,
-)
+from operators.slam.landmarks.association import Association, Density, agreed_pairs, jointly_compatible, nearest, tight
 from operators.slam.landmarks.consistency import Consistency
 
 Array = NDArray[np.float64]
@@ -490,7 +483,7 @@ def _root(covariance: Array) -> Array:
 
 
 def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi
+    return float((angle + math.pi) % (2 * math.pi) - math.pi)
 
 
 def _within(seen: Array, points: Array) -> NDArray[np.bool_]:

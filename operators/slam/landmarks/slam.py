@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, LandmarkSightings, Odometry, Transforms
-from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix, transform_points, yaw_of
+from dataflow.messages.geometry import invert, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
+from operators.geometry.planar import PLANAR, flat, placed_in, planar
+from operators.localization.interpretation import cartesian
 from operators.slam.landmarks.association import Association
 from operators.slam.landmarks.filter import LandmarkFilter
 from operators.status import counted_status
@@ -102,11 +104,15 @@ class LandmarkSlam(Operator, merge=True):
         if odometry is None:
             return None
         seen = self._advance(odometry)
-        T_map_base = _matrix(self.state.filter.position, self.state.filter.heading)
-        result: dict[str, Any] = {"pose": self._pose(odometry, T_map_base)}
+        x, y = self.state.filter.position
+        T_map_base = planar(x, y, self.state.filter.heading)
+        covariance = self.state.filter.pose_covariance()
+        result: dict[str, Any] = {
+            "pose": placed_in(self.map_frame, odometry.child_frame, T_map_base, covariance, odometry)
+        }
         if seen:
             result["correction"] = Transforms.from_matrix(
-                T_map_base @ invert(_flat(odometry)),
+                T_map_base @ invert(flat(odometry)),
                 stamp=odometry.stamp,
                 frame=self.map_frame,
                 child_frame=odometry.frame,
@@ -151,11 +157,14 @@ class LandmarkSlam(Operator, merge=True):
 
     def _planar(self, sightings: LandmarkSightings, T_base_sensor: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Identities, positions (N, 2) and covariances (N, 2, 2) in the robot's frame, of what is usable."""
-        points, spread = _cartesian(sightings)
+        if sightings.covariances is None:
+            raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
+        points, spread = cartesian(sightings)
+        spread = spread[:, :2, :2]
         yaw = math.atan2(T_base_sensor[1, 0], T_base_sensor[0, 0])
         R = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-        flat = transform_points(T_base_sensor, points)[:, :2]
-        usable = np.asarray(np.isfinite(flat).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
+        level = transform_points(T_base_sensor, points)[:, :2]
+        usable = np.asarray(np.isfinite(level).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
         usable &= np.linalg.det(np.where(usable[:, None, None], spread, 0.0)) > 0
         self.state.ignored["invalid"] += int((~usable).sum())
         ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
@@ -164,7 +173,7 @@ class LandmarkSlam(Operator, merge=True):
         again = ~first & (ids >= 0)  # one landmark is one sighting of a message
         self.state.ignored["twice in a message"] += int((usable & again).sum())
         usable &= ~again
-        return ids[usable], flat[usable], R @ spread[usable] @ R.T
+        return ids[usable], level[usable], R @ spread[usable] @ R.T
 
     def _advance(self, odometry: Odometry) -> bool:
         """Moves to an odometry message, with the sightings on the way; returns whether there were any."""
@@ -174,7 +183,7 @@ class LandmarkSlam(Operator, merge=True):
             begin = odometry.stamp
         else:
             begin, span = last.stamp, odometry.stamp - last.stamp
-            T = invert(_flat(last)) @ _flat(odometry)
+            T = invert(flat(last)) @ flat(odometry)
             step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
             reach = self.max_speed * span * 1e-9
             if math.hypot(step[0], step[1]) > reach:
@@ -205,60 +214,13 @@ class LandmarkSlam(Operator, merge=True):
     def _noise(self, odometry: Odometry, step: Array, seconds: float) -> Array:
         """Covariance (3, 3) of a step (x, y, heading)."""
         if odometry.twist_covariance is not None:
-            planar = [0, 1, 5]
-            given = odometry.twist_covariance[np.ix_(planar, planar)]
+            given = odometry.twist_covariance[np.ix_(PLANAR, PLANAR)]
             if np.isfinite(given).all() and (np.diag(given) >= 0).all():
                 return np.asarray(given * seconds**2)
             self.state.ignored["covariance of odometry: not finite or negative"] += 1
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
-
-    def _pose(self, odometry: Odometry, T_map_base: Array) -> Odometry:
-        covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
-        planar = [0, 1, 5]
-        covariance[np.ix_(planar, planar)] = self.state.filter.pose_covariance()
-        return Odometry.from_matrix(
-            T_map_base,
-            stamp=odometry.stamp,
-            frame=self.map_frame,
-            child_frame=odometry.child_frame,
-            linear=odometry.linear,
-            angular=odometry.angular,
-            pose_covariance=covariance,
-        )
-
-
-def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
-    """Points (N, 3) in the sensor's frame and the covariances (N, 2, 2) of their x and y. Raises ValueError."""
-    if sightings.positions is not None:
-        flat = sightings.positions
-        points = np.column_stack([flat, np.zeros(len(flat))]) if flat.shape[1] == 2 else flat
-        if sightings.covariances is None:
-            raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
-        return points, sightings.covariances[:, :2, :2]
-    if sightings.ranges is None or sightings.bearings is None:
-        raise ValueError("sightings need positions, or ranges and bearings: one of the two does not say where it is")
-    if sightings.covariances is None:
-        raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
-    r, b = sightings.ranges, sightings.bearings
-    e = np.zeros_like(r) if sightings.elevations is None else sightings.elevations
-    r, b, e = (np.where(np.isfinite(one), one, np.nan) for one in (r, b, e))
-    level = r * np.cos(e)
-    points = np.column_stack([level * np.cos(b), level * np.sin(b), r * np.sin(e)])
-    J = np.empty((len(r), 2, 2))
-    J[:, 0, 0], J[:, 0, 1] = np.cos(e) * np.cos(b), -level * np.sin(b)
-    J[:, 1, 0], J[:, 1, 1] = np.cos(e) * np.sin(b), level * np.cos(b)
-    return points, J @ sightings.covariances[:, :2, :2] @ J.transpose(0, 2, 1)
-
-
-def _flat(odometry: Odometry) -> Array:
-    """The pose in the plane, as a rigid motion (4, 4)."""
-    return _matrix(odometry.position[:2], float(yaw_of(odometry.orientation)))
-
-
-def _matrix(position: Array, heading: float) -> Array:
-    return transform_matrix([position[0], position[1], 0.0], quaternion_from_yaw(heading))
 
 
 def _arc(step: Array, share: float) -> Array:
@@ -269,4 +231,4 @@ def _arc(step: Array, share: float) -> Array:
     vx, vy = chord * step[0] + half * step[1], chord * step[1] - half * step[0]
     part = turn * share
     a, b = (share, share * part / 2) if abs(turn) < 1e-6 else (math.sin(part) / turn, (1 - math.cos(part)) / turn)
-    return _matrix(np.array([a * vx - b * vy, b * vx + a * vy]), part)
+    return planar(a * vx - b * vy, b * vx + a * vy, part)

@@ -16,10 +16,10 @@ from dataflow.operator import KEPT, Out, Param
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix, adjoint
 from operators.odometry.lidar.odometry import LidarOdometry, LidarState
-from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
+from operators.slam.emission import corrections, map_due, map_poses, path_of, sizes, status_of
 from operators.slam.lidar.graph import LidarGraph, LidarSettings
 from operators.slam.lidar.map_file import points_of, read_lidar_map, write_lidar_map
-from operators.slam.lidar.mapper import LidarMapper, Mapped
+from operators.slam.lidar.mapper import LidarMapper
 from operators.slam.lidar.view import LidarEyes, LidarView
 
 
@@ -91,8 +91,7 @@ class LidarSlam(LidarOdometry):
         self.state.places.update(f"refused: {_kind(reason)}" for reason in mapped.added.refused)
         status, odometry = messages["status"], messages.get("odometry")
         assert isinstance(status, Diagnostics)
-        counts = sizes(graph) | {"loops": graph.loops}
-        messages["status"] = status_of("lidar_slam", mapped.place, mapped.reason, counts, status)
+        messages["status"] = status_of("lidar_slam", mapped.place, mapped.reason, sizes(graph), status)
         back = invert(T_body_lidar)
         if mapped.T_map_odom is not None and isinstance(odometry, Odometry):
             carried = adjoint(T_body_lidar)
@@ -106,7 +105,7 @@ class LidarSlam(LidarOdometry):
         if mapped.added.loops:
             poses = [(each, T_body_lidar @ T @ back) for each, T in map_poses(graph)]
             messages["path"] = path_of(poses, self.map_frame, cloud.stamp)
-        if graph.located and self._map_due(mapped):
+        if map_due(graph, mapped.added, self.period):
             messages["map"] = self._map(T_body_lidar, cloud.stamp)
         return messages
 
@@ -117,16 +116,12 @@ class LidarSlam(LidarOdometry):
 
     def summary(self) -> Mapping[str, float | int | str]:
         """Returns the number of scans of each state, of loops, and of keyframes that were refused, by reason."""
-        graph = self.state.mapper.graph
-        return {**super().summary(), **self.state.places, **sizes(graph), "loops": graph.loops}
+        return {**super().summary(), **self.state.places, **sizes(self.state.mapper.graph)}
 
     def _map(self, T_body_lidar: Matrix, stamp: int) -> PointCloud:
         points = points_of(self.state.mapper.graph.nodes.values(), self.map_voxel)
         placed = transform_points(T_body_lidar, points).astype(np.float32)
         return PointCloud(stamp=stamp, frame=self.map_frame, points=placed)
-
-    def _map_due(self, mapped: Mapped) -> bool:
-        return mapped.added.loops > 0 or (mapped.added.node and len(self.state.mapper.graph.nodes) % self.period == 0)
 
     def _new_mapper(self) -> LidarMapper:
         searched = Settings(self.map_voxel, 1, self.min_overlap, self.min_fitness, self.max_violation)

@@ -6,8 +6,6 @@ Distinct from those in a small window is enough where a pose predicts that windo
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,36 +18,34 @@ RATIO = 0.85  # of the distance of descriptors to that of the second nearest in 
 FARTHEST = 0.5  # squared distance of rooted descriptors beyond which they do not show the same
 
 
-class Features(Protocol):
-    """Holds pixels (N, 2), points (N, 3) in the depth camera, NaN where unknown, and rooted descriptors (N, 128)."""
-
-    @property
-    def pixels(self) -> NDArray[np.float32]: ...
-    @property
-    def points(self) -> NDArray[np.float32]: ...
-    @property
-    def rooted(self) -> NDArray[np.float32]: ...
-
-
 def guided_pairs(
-    known: Features, seen: Features, T_known_seen: Matrix, camera: RgbdCamera, window: float
+    points: NDArray[np.float32],
+    rooted: NDArray[np.float32],
+    pixels: NDArray[np.float32],
+    seen: NDArray[np.float32],
+    T_known_seen: Matrix,
+    camera: RgbdCamera,
+    window: float,
 ) -> NDArray[np.int64]:
-    """Returns pairs of indices (M, 2), each feature once, at most `window` working pixels from its prediction."""
+    """Returns pairs of indices (M, 2), each feature once, at most `window` working pixels from its prediction.
+
+    The known features have points (N, 3) in the known depth camera, NaN where unknown, and rooted descriptors (N, 128);
+    the `seen` ones rooted descriptors (M, 128) at pixels (M, 2).
+    """
     nothing = np.zeros((0, 2), np.int64)
-    there = np.flatnonzero(np.isfinite(known.points[:, 2]))
-    if not len(there) or len(seen.pixels) < 2:
+    there = np.flatnonzero(np.isfinite(points[:, 2]))
+    if not len(there) or len(pixels) < 2:
         return nothing
-    points = transform_points(camera.T_color_depth @ invert(T_known_seen), known.points[there].astype(np.float64))
-    ahead = points[:, 2] > 0.05
-    there, pixels = there[ahead], project(points[ahead], camera.K_color)
-    pixels, others = pixels.astype(np.float32), seen.pixels
-    near = np.abs(pixels[:, :1] - others[:, 0]) < window
-    near &= np.abs(pixels[:, 1:] - others[:, 1]) < window
+    moved = transform_points(camera.T_color_depth @ invert(T_known_seen), points[there].astype(np.float64))
+    ahead = moved[:, 2] > 0.05
+    there, at = there[ahead], project(moved[ahead], camera.K_color).astype(np.float32)
+    near = np.abs(at[:, :1] - pixels[:, 0]) < window
+    near &= np.abs(at[:, 1:] - pixels[:, 1]) < window
     a, b = np.nonzero(near)
     if not len(a):
         return nothing
     distance = np.full(near.shape, np.inf, np.float32)
-    distance[a, b] = 2.0 - 2.0 * np.einsum("ij,ij->i", known.rooted[there[a]], seen.rooted[b])
+    distance[a, b] = 2.0 - 2.0 * np.einsum("ij,ij->i", rooted[there[a]], seen[b])
     nearest = distance.argmin(axis=1)
     rows = np.arange(len(there))
     least = distance[rows, nearest]

@@ -24,14 +24,6 @@ Indices = NDArray[np.int64]
 Nodes = Mapping[int, Node[View]]
 
 
-def _none(*shape: int) -> Array:
-    return np.zeros((0, *shape))
-
-
-def _nobody() -> Indices:
-    return np.zeros(0, np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class Sightings:
     """Holds which nodes (S,) saw which points (S,), by row, at what pixels (S, 2) of the working image and with what
@@ -51,15 +43,6 @@ class Sightings:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Cloud:
-    """The points of a map as `guided_pairs` takes them, in the map's frame."""
-
-    pixels: NDArray[np.float32]
-    points: NDArray[np.float32]
-    rooted: NDArray[np.float32]
-
-
 class MapPoints(Remembered):
     """Points by row and their sightings.
 
@@ -73,8 +56,9 @@ class MapPoints(Remembered):
     sightings: Sightings
 
     def __init__(self) -> None:
-        self.anchors, self.features, self.local = _nobody(), _nobody(), _none(3)
-        self.sightings = Sightings(_nobody(), _nobody(), _none(2), _none())
+        none = np.zeros(0, np.int64)
+        self.anchors, self.features, self.local = none, none, np.zeros((0, 3))
+        self.sightings = Sightings(none, none, np.zeros((0, 2)), np.zeros(0))
 
     def see(self, number: int, view: View, nodes: Nodes, around: Sequence[int], camera: RgbdCamera) -> None:
         """Takes what the view of a new node shows of points that the nodes `around` saw first, and new points.
@@ -85,8 +69,9 @@ class MapPoints(Remembered):
         rows = np.flatnonzero(np.isin(self.anchors, np.array(around, np.int64)))
         matched = np.zeros(len(view.pixels), np.bool_)
         if len(rows):
-            known = _Cloud(view.pixels[:0], self.world(rows, nodes).astype(np.float32), self._rooted(rows, nodes))
-            pairs = guided_pairs(known, view, nodes[number].T, camera, WINDOW)
+            points = self.world(rows, nodes).astype(np.float32)
+            rooted = self._rooted(rows, nodes)
+            pairs = guided_pairs(points, rooted, view.pixels, view.rooted, nodes[number].T, camera, WINDOW)
             self._add(number, rows[pairs[:, 0]], pairs[:, 1], view)
             matched[pairs[:, 1]] = True
         if nodes[number].view is None:

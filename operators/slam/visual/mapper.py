@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.geometry.se3 import Matrix
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter
 from operators.odometry.rgbd.local_map import LocalMap
@@ -15,21 +14,16 @@ from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import scaled_intrinsics
 from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.tracking import Status, TrackResult
-from operators.slam.place import Place, place_of
+from operators.slam.place import Mapped, mapped
 from operators.slam.sensor_model import Added
 from operators.slam.visual.graph import GraphSettings, VisualGraph
 
 
 @dataclass(frozen=True, eq=False)
-class SlamResult:
-    """Holds what a frame gave. `T_map_odom` is None while the place in the map is not known."""
+class SlamResult(Mapped):
+    """Holds what a frame gave to the map, and what the odometry made of it."""
 
     odometry: TrackResult
-    place: Place
-    reason: str
-    T_map_odom: Matrix | None
-    covariance: Matrix  # (6, 6) of the camera's pose in the map, right perturbation
-    added: Added
 
 
 @dataclass(eq=False)
@@ -70,15 +64,8 @@ class RgbdSlam:
             state = self._odometry.state
             added = self.graph.add(state.map.newest, Fitter(working, self._config, state.noise), self.state.jumped)
             self.state.jumped &= not added.node
-        missing = result.status in (Status.PREDICTED, Status.LOST)
-        adrift = f"odometry {result.status}: {result.reason}" if missing else ""
-        place, reason = place_of(self.graph, added, adrift, result.reason)
-        known = self.graph.located
-        return SlamResult(
-            odometry=result,
-            place=place,
-            reason=reason,
-            T_map_odom=self.graph.T_map_odom.copy() if known else None,
-            covariance=self.graph.covariance_at(result.T_world_camera, result.covariance),
-            added=added,
-        )
+        found = mapped(
+            self.graph, added, result.status, result.reason, result.T_world_camera, result.covariance,
+            self.graph.located,
+        )  # fmt: skip
+        return SlamResult(**vars(found), odometry=result)

@@ -20,7 +20,7 @@ from operators.odometry.rgbd.frame import Frame
 from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.rgbd.local_map import LocalMap
 from operators.odometry.rgbd.noise import Noise
-from operators.odometry.rgbd.relocalizer import rough_points
+from operators.odometry.rgbd.relocalizer import lifted
 from operators.odometry.rgbd.standing import doubtful, part, standing
 from operators.odometry.rgbd.surface import Surface
 from operators.slam.visual.guided import guided_pairs
@@ -55,8 +55,7 @@ class View:
     def of(keyframe: Keyframe, camera: RgbdCamera) -> View:
         """Returns the view of a keyframe, whose working image the camera's K_color is of."""
         described = keyframe.description
-        everything = np.arange(len(described.pixels))
-        points, known = rough_points(keyframe, everything, camera)
+        points, known = lifted(described.pixels, keyframe.surface, camera)
         patches = transform_points(camera.T_color_depth, keyframe.surface.points(STRIDE))
         u, v = np.rint(project(patches, camera.K_color)).astype(np.int64).T
         height, width = keyframe.gray.shape
@@ -162,7 +161,7 @@ def astray(noise: Noise) -> float:
 def _guided(
     known: View, seen: View, T_known_seen: Matrix, fitter: Fitter, window: float
 ) -> tuple[Sighting | None, int]:
-    pairs = guided_pairs(known, seen, T_known_seen, fitter.camera, window)
+    pairs = guided_pairs(known.points, known.rooted, seen.pixels, seen.rooted, T_known_seen, fitter.camera, window)
     return _solved(known, seen, pairs, fitter), len(pairs)
 
 

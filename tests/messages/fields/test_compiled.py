@@ -19,31 +19,10 @@ from dataflow.messages import Message, MessageError, array, scalar
 from dataflow.messages.fields.compiled_digest import ONE_UPDATE
 
 TYPES = [cls for classes in families().values() for cls in classes]
-ODD: tuple[Any, ...] = (
-    None,
-    True,
-    3,
-    -(2**70),
-    2.5,
-    np.float32(2.5),
-    np.int16(7),
-    "text",
-    "größe",
-    "\ud800",
-    ("a", "b"),
-    ["a", 1],
-    [],
-    np.zeros((2, 3), np.float32),
-    np.zeros((2, 3), ">f8"),
-    np.zeros((2, 4)),
-    np.zeros((3, 2), np.float32).T,
-    np.ones((2, 2), np.uint8),
-    np.ones(2, np.int64),
-    np.zeros(0, np.int32),
-    np.zeros((0, 3)),
-    np.zeros((2, 3), bool),
-    object(),
-)
+ODD: list[Any] = [None, True, 3, -(2**70), 2.5, np.float32(2.5), np.int16(7), "text", "größe", "\ud800", ("a", "b")]
+ODD += [["a", 1], [], object(), np.zeros((2, 3), np.float32), np.zeros((2, 3), ">f8"), np.zeros((2, 4))]
+ODD += [np.zeros((3, 2), np.float32).T, np.ones((2, 2), np.uint8), np.ones(2, np.int64), np.zeros(0, np.int32)]
+ODD += [np.zeros((0, 3)), np.zeros((2, 3), bool)]
 
 
 def documented_digest(message: Message) -> bytes:
@@ -174,10 +153,10 @@ def test_a_type_below_another_has_its_own_constructor() -> None:
     below = Below(stamp=1, first=[1], third=[[1.0]], more=4)
     assert (below.more, below.digest()) == (4, documented_digest(below))
     with pytest.raises(MessageError, match=r"tests\.Large has no field 'more'"):
-        Large(stamp=1, first=[1], third=[[1.0]], more=4)  # type: ignore[call-arg]
+        Large(stamp=1, first=[1], third=[[1.0]], more=4)
 
 
-def test_a_constructor_that_somebody_has_written_stays() -> None:
+def test_a_handwritten_constructor_stays() -> None:
     class Written(Message, schema="tests.Written"):
         """Takes its value by position."""
 

@@ -76,7 +76,7 @@ def test_views_that_repeat_each_other_and_blurred_ones_count_once_or_not() -> No
     ],
 )
 def test_poor_views_are_named(how: dict[str, float], warning: str | None) -> None:
-    found = warnings_of(fitted(LENS, views_of(LENS, **{"count": 30, **how})))  # type: ignore[arg-type]
+    found = warnings_of(fitted(LENS, views_of(LENS, **{"count": 30, **how})))
 
     assert any(warning in text for text in found) if warning else found == []
 

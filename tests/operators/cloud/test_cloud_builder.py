@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, PointCloud, Pose, Transforms
+from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
 from operators.cloud import CloudBuilder
 from operators.sources import SyntheticRgbd
 
@@ -36,13 +36,7 @@ def build(
 ) -> PointCloud:
     builder = CloudBuilder(**({"stride": 1, "min_range": 0.0, "max_range": 10.0} | params))
     given = (depth_image(depth), position_image(), info("depth"), info("color", image_focal), extrinsics)
-    return cloud_of(builder.process(*given))
-
-
-def cloud_of(messages: dict[str, Message]) -> PointCloud:
-    cloud = messages["cloud"]
-    assert isinstance(cloud, PointCloud)
-    return cloud
+    return builder.process(*given)["cloud"]
 
 
 @settings(max_examples=25, deadline=None)
@@ -56,7 +50,6 @@ def test_points_project_back_to_their_pixels_and_depths(seed: int, stride: int) 
     assert u.tolist() == columns.ravel().tolist()
     assert v.tolist() == rows.ravel().tolist()
     np.testing.assert_array_equal(cloud.points[:, 2], depth.astype(np.float32)[v, u])
-    assert cloud.colors is not None
     np.testing.assert_array_equal(cloud.colors[:, :2], np.stack([u, v], axis=1))
     assert (cloud.stamp, cloud.frame) == (5, "depth")
 
@@ -78,7 +71,6 @@ def test_what_lies_beside_a_missing_return_is_no_edge(nothing: float) -> None:
 
 def test_the_colour_cameras_own_focal_length_is_used() -> None:
     cloud = build(np.full((HEIGHT, WIDTH), 2.0), image_focal=25.0, edge_ratio=0)
-    assert cloud.colors is not None
     expected = np.rint(cloud.points[:, 0] / cloud.points[:, 2] * np.float32(25) + np.float32(31.5))
     np.testing.assert_array_equal(cloud.colors[:, 0], expected)
 
@@ -94,7 +86,6 @@ def test_extrinsics_shift_the_colours_by_the_parallax(inverse: bool) -> None:
     else:
         given_transform = Transforms.from_matrix(T_depth_image, stamp=0, frame="depth", child_frame="color")
     cloud = build(np.full((HEIGHT, WIDTH), 2.0), given_transform, edge_ratio=0)
-    assert cloud.colors is not None
     colors = cloud.colors.reshape(HEIGHT, WIDTH, 3)
     assert colors[7, 10:].tolist() == [[u - 10, 7, 0] for u in range(10, WIDTH)]
     assert not colors[:, :10].any()  # not seen by the colour camera: black
@@ -114,16 +105,15 @@ def test_flying_pixels_at_edges_are_dropped_and_slopes_kept() -> None:
 def test_grey_images_colour_in_grey() -> None:
     grey = Image(stamp=5, frame="color", data=np.full((HEIGHT, WIDTH), 77, np.uint8))
     depth = depth_image(np.full((HEIGHT, WIDTH), 2.0))
-    cloud = cloud_of(CloudBuilder(stride=8).process(depth, grey, info("depth"), info("color")))
-    assert cloud.colors is not None
+    cloud = CloudBuilder(stride=8).process(depth, grey, info("depth"), info("color"))["cloud"]
     assert (cloud.colors == 77).all()
 
 
 def test_a_new_calibration_replaces_the_ray_table() -> None:
     builder = CloudBuilder(stride=4, edge_ratio=0)
     depth, image = depth_image(np.full((HEIGHT, WIDTH), 2.0)), position_image()
-    narrow = cloud_of(builder.process(depth, image, info("depth", 100.0), info("color")))
-    wide = cloud_of(builder.process(depth, image, info("depth", 50.0), info("color")))
+    narrow = builder.process(depth, image, info("depth", 100.0), info("color"))["cloud"]
+    wide = builder.process(depth, image, info("depth", 50.0), info("color"))["cloud"]
     np.testing.assert_allclose(wide.points[:, 0], 2 * narrow.points[:, 0], rtol=1e-6)
 
 
@@ -133,32 +123,21 @@ def test_clouds_of_a_sequence_agree_in_the_world() -> None:
     source.setup()
     statics, frames = source.static_outputs(), [dict(m) for m in source.stream()]
     K_info = statics["depth_info"]
-    assert isinstance(K_info, CameraInfo)
     builder = CloudBuilder(stride=3)
     made = builder.process(
-        frames[0]["depth"], frames[0]["image"], K_info, statics["image_info"], statics["extrinsics"]  # type: ignore[arg-type]
+        frames[0]["depth"], frames[0]["image"], K_info, statics["image_info"], statics["extrinsics"]
     )  # fmt: skip
-    cloud = cloud_of(made)
+    cloud = made["cloud"]
     first, second, depth, image = *(f["ground_truth"] for f in frames), frames[1]["depth"], frames[1]["image"]
-    assert isinstance(first, Pose)
-    assert isinstance(second, Pose)
     T = np.linalg.inv(second.matrix()) @ first.matrix()
     x, y, z = (cloud.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).T
     u = (K_info.fx * x / z + K_info.cx).astype(np.float32)
     v = (K_info.fy * y / z + K_info.cy).astype(np.float32)
     inside = (u > 1) & (v > 1) & (u < K_info.width - 2) & (v < K_info.height - 2)
-    seen = cv2.remap(depth.data, u, v, cv2.INTER_LINEAR).ravel()  # type: ignore[attr-defined]
+    seen = cv2.remap(depth.data, u, v, cv2.INTER_LINEAR).ravel()
     assert np.median(np.abs(seen - z)[inside]) < 2e-3
-    looks = cv2.remap(image.data, u, v, cv2.INTER_LINEAR).reshape(-1, 3)  # type: ignore[attr-defined]
-    assert cloud.colors is not None
+    looks = cv2.remap(image.data, u, v, cv2.INTER_LINEAR).reshape(-1, 3)
     assert np.median(np.abs(looks.astype(float) - cloud.colors)[inside]) < 8
-
-
-def test_equal_inputs_give_equal_digests() -> None:
-    depth = np.random.default_rng(2).uniform(0.5, 5, (HEIGHT, WIDTH))
-    first, again = build(depth, edge_ratio=0), build(depth, edge_ratio=0)
-    assert first.digest() == again.digest()
-    assert first.digest() != build(depth + 0.001, edge_ratio=0).digest()
 
 
 @pytest.mark.parametrize(
@@ -171,12 +150,11 @@ def test_equal_inputs_give_equal_digests() -> None:
         (2.0, 5000.0, "3072 points of 3072 pixels; the colour camera sees none of them"),
     ],
 )
-def test_the_status_says_what_became_of_the_pixels(depth: float, focal: float, text: str) -> None:
+def test_status_counts_pixels_and_points(depth: float, focal: float, text: str) -> None:
     builder = CloudBuilder(stride=1)
     given = depth_image(np.full((HEIGHT, WIDTH), depth))
     aside = Transforms.from_matrix(np.eye(4) + np.eye(4, k=3), stamp=0, frame="color", child_frame="depth")
     status = builder.process(given, position_image(), info("depth"), info("color", focal), aside)["status"]
-    assert isinstance(status, Diagnostics)
     assert status.messages == (text,)
     assert int(status.levels[0]) == (0 if text.endswith("pixels") else 1)
 

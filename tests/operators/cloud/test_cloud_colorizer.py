@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.messages import CameraInfo, Clusters, Diagnostics, Image, PointCloud, SegmentationMap, Transforms
+from dataflow.messages import CameraInfo, Image, PointCloud, SegmentationMap, Transforms
 from dataflow.testing import Played, play
 from operators.cloud import CloudColorizer
 
@@ -42,9 +42,6 @@ UNSEEN = [[0, 0, -4], [9, 0, 4], [np.nan, 0, 1]]
 def test_a_point_takes_the_colour_of_its_pixel() -> None:
     played = colored([*SEEN, *UNSEEN])
     cloud, status = played["colored"][0], played["status"][0]
-    assert isinstance(cloud, PointCloud)
-    assert isinstance(status, Diagnostics)
-    assert cloud.colors is not None
     assert cloud.colors.tolist() == [[15, 20, 7], [10, 30, 7], [29, 1, 7], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
     assert status.pairs(0) == {
         "points": "6", "seen": "3", "hidden": "0", "outside the image": "1", "behind or not finite": "2"
@@ -54,8 +51,6 @@ def test_a_point_takes_the_colour_of_its_pixel() -> None:
 
 def test_unseen_points_are_left_out_with_their_fields_where_that_is_asked_for() -> None:
     cloud = colored([*UNSEEN, *SEEN], seen_only=True)["colored"][0]
-    assert isinstance(cloud, PointCloud)
-    assert cloud.intensities is not None
     assert cloud.intensities.tolist() == [3, 4, 5]
 
 
@@ -63,8 +58,6 @@ def test_what_something_nearer_hides_is_not_coloured() -> None:
     behind = [[0, 0, 2], [0.1, 0, 6], [0, 0, 2.1]]
     for slack, expected in ((0.1, [True, False, True]), (0.0, [True, True, True])):
         cloud = colored(behind, slack=slack)["colored"][0]
-        assert isinstance(cloud, PointCloud)
-        assert cloud.colors is not None
         assert cloud.colors.any(axis=1).tolist() == expected
 
 
@@ -72,8 +65,6 @@ def test_points_take_the_class_of_their_pixel() -> None:
     classes = np.full((30, 40), 2, np.uint8)
     classes[10, 30], classes[29, 1] = 0, 255
     labels = colored([*SEEN, *UNSEEN], classes=classes)["labels"][0]
-    assert isinstance(labels, Clusters)
-    assert labels.ids is not None
     assert labels.ids.tolist() == [0, 2]
     assert labels.labels.tolist() == [1, 0, -1, -1, -1, -1]
     np.testing.assert_allclose(labels.centroids[0], lidar_points([SEEN[1]])[0], atol=1e-6)
@@ -82,7 +73,6 @@ def test_points_take_the_class_of_their_pixel() -> None:
 def test_an_empty_cloud_is_a_warning() -> None:
     played = colored(np.zeros((0, 3)))
     status = played["status"][0]
-    assert isinstance(status, Diagnostics)
     assert (status.messages[0], status.levels[0]) == ("the cloud is empty", 1)
 
 
@@ -104,8 +94,3 @@ def test_a_wrong_mount_is_refused() -> None:
     image = Image(stamp=1, frame="camera", data=PIXELS)
     with pytest.raises(Exception, match="no transform between 'other' and 'camera'"):
         play(CloudColorizer(), {"cloud": [cloud], "image": [image], "image_info": [INFO], "extrinsics": [MOUNT]})
-
-
-def test_repeated_runs_give_equal_bits() -> None:
-    camera = np.random.default_rng(2).uniform((-3, -2, -1), (3, 2, 6), (2000, 3))
-    assert colored(camera).digests() == colored(camera).digests()

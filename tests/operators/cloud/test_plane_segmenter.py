@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 
-from dataflow.messages import Boxes3D, Diagnostics, Planes, PointCloud, Pose
+from dataflow.messages import Boxes3D, Planes, PointCloud, Pose
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play
 from operators.cloud import PlaneSegmenter
@@ -70,9 +72,6 @@ def segmented(given: PointCloud, T: np.ndarray | None = None, **params: Any) -> 
     streams: dict[str, Any] = {"cloud": [given]} | ({} if T is None else {"pose": [pose(T)]})
     played = play(PlaneSegmenter(**params), streams)
     (planes,), (surfaces,), (rest,) = played["planes"], played["surfaces"], played["rest"]
-    assert isinstance(planes, Planes)
-    assert isinstance(surfaces, Boxes3D)
-    assert isinstance(rest, PointCloud)
     return planes, surfaces, rest
 
 
@@ -126,7 +125,7 @@ def test_the_hull_of_a_plane_is_what_is_seen_of_it() -> None:
         assert on.max() < 1e-4  # no corner lies outside of an edge
 
 
-def test_without_a_pose_the_parameter_says_which_way_is_up() -> None:
+def test_up_is_the_parameter_without_a_pose() -> None:
     T = optical()
     given = cloud(room(), T)
     _, surfaces, _ = segmented(given, up=tuple(T[2, :3]))
@@ -185,7 +184,6 @@ def test_the_floor_is_remembered_where_only_a_table_is_seen() -> None:
     clouds = [cloud(room(), T, 1), cloud(room(floor=False), T, 2)]
     played = play(PlaneSegmenter(), {"cloud": clouds, "pose": [pose(T, 1), pose(T, 2)]})
     _, second = played["surfaces"]
-    assert isinstance(second, Boxes3D)
     assert sorted(second.labels()) == ["table", "wall", "wall"]
 
 
@@ -196,9 +194,6 @@ def test_a_cloud_too_small_for_planes_is_a_warning(points: np.ndarray) -> None:
     given = PointCloud(stamp=1, frame="camera", points=points.astype(np.float32))
     played = play(PlaneSegmenter(), {"cloud": [given]})
     (status,), (planes,), (rest,) = played["status"], played["planes"], played["rest"]
-    assert isinstance(status, Diagnostics)
-    assert isinstance(planes, Planes)
-    assert isinstance(rest, PointCloud)
     assert status.levels.tolist() == [1]
     assert "no plane in the cloud" in status.messages[0]
     assert planes.count == 0
@@ -217,30 +212,18 @@ def test_a_pose_of_another_frame_without_extrinsics_is_named() -> None:
 
 
 @pytest.mark.long
-def test_two_plays_are_equal_and_a_restored_operator_goes_on_alike() -> None:
+def test_segmenters_repeat_and_a_restored_one_remembers_the_floor() -> None:
     T = optical()
-    streams: dict[str, Any] = {"cloud": [cloud(room(seed=k), T, k + 1) for k in range(2)], "pose": [pose(T)]}
-    first, again = PlaneSegmenter(), PlaneSegmenter()
-    assert play(first, streams).digests() == play(again, streams).digests()
-    restored = PlaneSegmenter()
-    restored.setup()
-    restored.restore(first.snapshot())
-    later = cloud(room(floor=False), T, 3)
-    one, other = (operator.process(later, pose(T, 3))["surfaces"] for operator in (first, restored))
-    assert sorted(one.labels()) == sorted(other.labels()) == ["table", "wall", "wall"]
+    parts = [room(seed=0), room(seed=1), room(floor=False)]
+    assert_repeats(PlaneSegmenter, [(cloud(each, T, k), pose(T, k)) for k, each in enumerate(parts, 1)], 2)
 
 
 def test_clouds_within_the_period_are_left_out_and_a_restored_operator_knows_the_last() -> None:
     T, second = optical(), 1_000_000_000
     stamps = [1, second // 2, second + 1, second + 2]
-    operator, restored = PlaneSegmenter(period=1.0), PlaneSegmenter(period=1.0)
-    for each in (operator, restored):
-        each.setup()
-    given = [(cloud(room(seed=k), T, stamp), pose(T, stamp)) for k, stamp in enumerate(stamps)]
-    assert [bool(operator.process(*each)) for each in given[:3]] == [True, False, True]
-    restored.restore(operator.snapshot())
-    assert not operator.process(*given[3])
-    assert not restored.process(*given[3])
+    calls = [(cloud(room(seed=k), T, stamp), pose(T, stamp)) for k, stamp in enumerate(stamps)]
+    made = assert_repeats(partial(PlaneSegmenter, period=1.0), calls, 3)
+    assert [bool(each) for each in made] == [True, False, True, False]
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1.0), (0.6, 0, 0.8), (-0.36, 0.48, -0.8)])

@@ -106,11 +106,11 @@ def test_a_few_metric_depths_make_it_metric_even_if_some_are_wrong(model: Path, 
 def test_grey_images_and_images_of_other_sizes_pass(model: Path) -> None:
     depth = scene()
     (found,) = estimated(model, photograph(depth, grey=True), sparse_of(depth, 40))["depth"]
-    np.testing.assert_allclose(found.data, depth, rtol=1e-3)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(found.data, depth, rtol=1e-3)
     large = np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1)
     (found,) = estimated(model, photograph(large), sparse_of(depth, 40))["depth"]
-    assert found.data.shape == large.shape  # type: ignore[attr-defined]
-    np.testing.assert_allclose(np.median(found.data / large), 1, rtol=0.01)  # type: ignore[attr-defined]
+    assert found.data.shape == large.shape
+    np.testing.assert_allclose(np.median(found.data / large), 1, rtol=0.01)
 
 
 def test_scale_alone_is_fitted_where_that_is_asked_for(model: Path) -> None:
@@ -118,13 +118,13 @@ def test_scale_alone_is_fitted_where_that_is_asked_for(model: Path) -> None:
     levels = np.rint(GAIN / depth).astype(np.uint8)
     image = Image(stamp=1, frame="camera", data=levels)
     (found,) = estimated(model, image, sparse_of(depth, 40), align="scale")["depth"]
-    np.testing.assert_allclose(found.data, depth, rtol=1e-3)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(found.data, depth, rtol=1e-3)
 
 
 def test_depths_beyond_the_range_are_no_returns(model: Path) -> None:
     depth = scene()
     (found,) = estimated(model, photograph(depth), sparse_of(depth, 40), max_range=2.0)["depth"]
-    np.testing.assert_array_equal(found.data > 0, depth <= 2.0 + 1e-6)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(found.data > 0, depth <= 2.0 + 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +251,6 @@ def test_a_real_network_orders_a_real_scene(data_dir: Path) -> None:
     true = np.where((true > 0.3) & (true < 6), true, 0)
     image = Image(stamp=1, frame="camera", data=np.asarray(pixels, np.uint8))
     (found,) = estimated(model, image, sparse_of(true, 3000))["depth"]
-    known = (true > 0) & (found.data > 0)  # type: ignore[attr-defined]
-    error = np.abs(found.data - true)[known] / true[known]  # type: ignore[attr-defined]
+    known = (true > 0) & (found.data > 0)
+    error = np.abs(found.data - true)[known] / true[known]
     assert np.median(error) < 0.12

@@ -92,7 +92,7 @@ def test_images_of_other_sizes_and_other_models_are_refused(tmp_path: Path) -> N
     with pytest.raises(ValueError, match="detections in an image of 70x60 pixels cannot be segmented in one of 80x60"):
         made.process(image(), detections(70))
     none = detections().replace(boxes=np.zeros((0, 4)), scores=[], class_ids=[])
-    assert made.process(image(), none).masks.shape == (0, HEIGHT, WIDTH // 8)  # type: ignore[union-attr]
+    assert made.process(image(), none).masks.shape == (0, HEIGHT, WIDTH // 8)
 
     class Plain(torch.nn.Module):
         def forward(self, x):

@@ -270,7 +270,7 @@ def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fa
         (lambda c: c["categories"][0].update(id="a"), r"annotations\.json: categories\[0\] .*an `id` \(an integer\)"),
     ],
 )
-def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None:
     file = write_coco(tmp_path, 3) / "annotations.json"
     content = json.loads(file.read_text())
     change(content)

@@ -68,13 +68,13 @@ def test_outputs_of_other_exports_than_yolov8_decodes_are_refused_with_the_reaso
 
 
 @pytest.mark.parametrize("decode", [decode_fastestdet, decode_yolov5, decode_yolov8])
-def test_scores_that_are_not_numbers_give_no_boxes(decode) -> None:  # type: ignore[no-untyped-def]
+def test_scores_that_are_not_numbers_give_no_boxes(decode) -> None:
     shape = (1, 85, 4, 4) if decode is decode_fastestdet else (1, 85, 85)
     assert len(decode([np.full(shape, np.nan, np.float32)], (64, 64), 0.0).scores) == 0
 
 
 @pytest.mark.parametrize("decode", [decode_fastestdet, decode_yolov5, decode_yolov8])
-def test_an_output_of_another_shape_is_refused_with_the_right_one(decode) -> None:  # type: ignore[no-untyped-def]
+def test_an_output_of_another_shape_is_refused_with_the_right_one(decode) -> None:
     with pytest.raises(ValueError, match=r"has shape \(1, .*got \(3, 7\)"):
         decode([np.zeros((3, 7), np.float32)], (64, 64), 0.1)
 

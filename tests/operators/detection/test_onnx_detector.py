@@ -242,7 +242,7 @@ def test_an_opened_input_holds_one_row_of_cells_of_padding(tmp_path: Path, monke
 
     class Session:
         def __init__(self, content: bytes, *told: str) -> None:
-            self._session = open_content(content, *told)  # type: ignore[arg-type]
+            self._session = open_content(content, *told)
             self.get_inputs, self.get_outputs = self._session.get_inputs, self._session.get_outputs
             self.get_modelmeta = self._session.get_modelmeta
 

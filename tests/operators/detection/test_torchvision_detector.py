@@ -35,7 +35,7 @@ def image(seed: int = 0, *, gray: bool = False) -> Image:
 
 
 def detector(checkpoint: Path, **params: object) -> TorchvisionDetector:
-    return TorchvisionDetector(model=NAME, checkpoint=str(checkpoint), score_threshold=0.2, **params)  # type: ignore[arg-type]
+    return TorchvisionDetector(model=NAME, checkpoint=str(checkpoint), score_threshold=0.2, **params)
 
 
 def test_boxes_are_those_of_the_model_itself(checkpoint: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_lower_threshold_is_not_cut_off_by_the_model(checkpoint: Path) -> None
 )
 def test_what_is_not_there_is_named_with_what_is(params: dict[str, str], words: str) -> None:
     with pytest.raises(OperatorFailure, match=words):
-        play(TorchvisionDetector(**params), {"image": [image()]})  # type: ignore[arg-type]
+        play(TorchvisionDetector(**params), {"image": [image()]})
 
 
 def test_missing_weights_are_said_with_the_way_to_get_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,7 +75,7 @@ def test_boxes_are_those_of_each_camera_alone_and_the_network_is_called_once(
     checkpoints: dict[str, str], model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = {"model": model, "checkpoint": checkpoints[model], "score_threshold": 0.3}
-    alone = one_by_one(TorchvisionDetector(**options), [image(c) for c in CAMERAS])  # type: ignore[arg-type]
+    alone = one_by_one(TorchvisionDetector(**options), [image(c) for c in CAMERAS])
     calls = calls_of(monkeypatch)
     rig = play(TorchvisionRigDetector(cameras=CAMERAS, **options), streams(*(image(c) for c in CAMERAS)))
     assert calls == [3]
@@ -95,7 +95,7 @@ def test_images_of_other_sizes_are_not_given_borders_by_their_neighbours(
 ) -> None:
     options = {"model": RCNN, "checkpoint": checkpoints[RCNN], "score_threshold": 0.3}
     seen = [image("front"), image("left", size=(64, 160)), image("rear")]
-    alone = one_by_one(TorchvisionDetector(**options), seen)  # type: ignore[arg-type]
+    alone = one_by_one(TorchvisionDetector(**options), seen)
     calls = calls_of(monkeypatch)
     rig = play(TorchvisionRigDetector(cameras=CAMERAS, **options), streams(*seen))
     assert sorted(calls) == [1, 2]
@@ -116,9 +116,9 @@ def test_a_camera_that_is_silent_holds_up_no_other(
 
 def test_maps_are_those_of_each_camera_alone(checkpoints: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     options = {"model": LRASPP, "checkpoint": checkpoints[LRASPP], "side": 64, "with_confidence": True}
-    alone = one_by_one(TorchvisionSegmenter(**options), [image(c) for c in CAMERAS])  # type: ignore[arg-type]
+    alone = one_by_one(TorchvisionSegmenter(**options), [image(c) for c in CAMERAS])
     calls = calls_of(monkeypatch)
-    rig = play(TorchvisionRigSegmenter(cameras=CAMERAS, **options), streams(*(image(c) for c in CAMERAS)))  # type: ignore[arg-type]
+    rig = play(TorchvisionRigSegmenter(cameras=CAMERAS, **options), streams(*(image(c) for c in CAMERAS)))
     assert calls == [3]
     for k, one in enumerate(alone):
         (found,) = rig[f"segmentation_{k + 1}"]

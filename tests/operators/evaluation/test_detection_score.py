@@ -29,13 +29,10 @@ def frame(rng: np.random.Generator) -> ScoredFrame:
     moved = truth[rng.integers(0, count, 6)] + rng.normal(0, 3, (6, 4)) if count else np.zeros((0, 4))
     moved[:, 2:] = np.maximum(moved[:, 2:], moved[:, :2] + 1)
     return ScoredFrame(
-        truth,
-        tuple(labels),
-        rng.random(count) < 0.3,
-        moved,
+        truth, tuple(labels), rng.random(count) < 0.3, moved,
         tuple(rng.choice([*labels, *NAMES], len(moved)).tolist()),
         rng.integers(1, 10, len(moved)).astype(np.float32) / np.float32(10),
-    )
+    )  # fmt: skip
 
 
 def by_one_evaluation(frames: Sequence[ScoredFrame], most: int, name: str) -> tuple[float | None, float | None]:
@@ -112,7 +109,7 @@ def test_a_detection_takes_8_bytes_once_it_is_matched() -> None:
     assert sum(len(held) * held.itemsize for held in kept) == 8 * sum(len(one.labels) for one in frames)
 
 
-def test_classes_that_nobody_saw_have_no_score() -> None:
+def test_classes_without_objects_have_no_score() -> None:
     assert score_frames([], ["mug"], max_detections=9, iou=0.5, score_threshold=0.5) == {
         "mug": ClassScore(0, 0, 0, None, None, 0, 0)
     }

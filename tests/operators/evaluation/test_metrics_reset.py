@@ -31,15 +31,9 @@ def test_a_trajectory_is_scored_from_the_last_jump_on() -> None:
 
 def boxes(stamp: int, count: int) -> Detections2D:
     return Detections2D(
-        stamp=stamp,
-        frame="camera",
-        width=100,
-        height=100,
-        class_names=("cup",),
-        boxes=np.array([[10, 10, 50, 50]] * count, np.float32).reshape(-1, 4),
-        scores=np.ones(count, np.float32),
-        class_ids=np.zeros(count, np.int32),
-    )
+        stamp=stamp, frame="camera", width=100, height=100, class_names=("cup",), scores=np.ones(count, np.float32),
+        boxes=np.array([[10, 10, 50, 50]] * count).reshape(-1, 4), class_ids=np.zeros(count, np.int32),
+    )  # fmt: skip
 
 
 def test_detections_are_scored_from_the_last_jump_on() -> None:

@@ -16,20 +16,12 @@ stamps = st.lists(st.integers(0, 300), max_size=30, unique=True).map(sorted)
 def test_pairs_are_those_of_the_whole_lists(found: list[int], truth: list[int], tolerance: int, step: int) -> None:
     pairing: Pairing[int, int] = Pairing(tolerance)
     pairs: list[tuple[int, int]] = []
-    for now in range(0, 301, step):
-        for stamp in found:
-            if now - step < stamp <= now:
-                pairing.add_found(stamp, stamp)
-        for stamp in truth:
-            if now - step < stamp <= now:
-                pairing.add_truth(stamp, stamp)
+    for now in range(0, 300 + step, step):
+        for stamps, add in ((found, pairing.add_found), (truth, pairing.add_truth)):
+            for stamp in stamps:
+                if now - step < stamp <= now:
+                    add(stamp, stamp)
         pairs += pairing.settle(now)
-    for stamp in found:
-        if stamp > 300 - 300 % step:
-            pairing.add_found(stamp, stamp)
-    for stamp in truth:
-        if stamp > 300 - 300 % step:
-            pairing.add_truth(stamp, stamp)
     pairs += pairing.finish()
     expected = [(found[i], truth[j]) for i, j in mutually_nearest(found, truth, tolerance)]
     assert sorted(pairs) == expected

@@ -8,62 +8,43 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_graphs import Thing, scene_graph
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Detections2D, Odometry, SceneGraph
-from dataflow.messages.geometry import quaternion_from_yaw
+from dataflow.messages import Detections2D, Odometry
 from dataflow.testing import play
 from operators.evaluation import SceneGraphMetrics
 
 SECOND = 1_000_000_000
 CLASSES = ("box", "table", "floor")
 TABLE, BOX, FAR = (
-    (1, 1, (2.0, 0.0, 0.4), (1.0, 0.8, 0.8)),
-    (2, 0, (2.0, 0.0, 0.9), (0.2, 0.2, 0.2)),
-    (3, 0, (9.0, 9.0, 0.1), (0.2, 0.2, 0.2)),
+    (1, "table", (2.0, 0.0, 0.4), (1.0, 0.8, 0.8)),
+    (2, "box", (2.0, 0.0, 0.9), (0.2, 0.2, 0.2)),
+    (3, "box", (9.0, 9.0, 0.1), (0.2, 0.2, 0.2)),
 )
 
-Node = tuple[int, int, tuple[float, float, float], tuple[float, float, float]]
 
-
-def graph(stamp: int, nodes: list[Node], relations: list[tuple[int, str, int]], **more: Any) -> SceneGraph:
-    ids = [node[0] for node in nodes]
-    return SceneGraph(
-        stamp=stamp,
-        frame=more.get("frame", "world"),
-        class_names=CLASSES,
-        predicates=tuple(p for _, p, _ in relations),
-        ids=np.array(ids, np.int64),
-        class_ids=np.array([node[1] for node in nodes], np.int32),
-        positions=np.array([node[2] for node in nodes]) + more.get("offset", 0.0),
-        sizes=np.array([node[3] for node in nodes]),
-        orientations=quaternion_from_yaw(np.zeros(len(nodes))).reshape(-1, 4),
-        subjects=np.array([ids.index(s) for s, _, _ in relations], np.int32),
-        objects=np.array([ids.index(o) for _, _, o in relations], np.int32),
-    )
+def graph(stamp: int, nodes: list[Thing], relations: list[tuple[int, str, int]], offset: Any = 0.0, **more: Any) -> Any:
+    made = scene_graph(nodes, relations, stamp=stamp, orientations=np.tile([0, 0, 0, 1.0], (len(nodes), 1)), **more)
+    return made.replace(positions=made.positions + offset)
 
 
 def seen(stamp: int, ids: list[int], visible: float = 1.0) -> Detections2D:
     return Detections2D(
-        stamp=stamp,
-        frame="camera",
-        width=640,
-        height=480,
-        class_names=CLASSES,
-        boxes=np.tile([10.0, 10, 50, 50], (len(ids), 1)),
-        scores=np.ones(len(ids), np.float32),
-        class_ids=np.zeros(len(ids), np.int32),
-        ids=np.array(ids, np.int64),
-        visible=np.full(len(ids), visible, np.float32),
-        pixel_counts=np.full(len(ids), 900, np.int64),
-    )
+        stamp=stamp, frame="camera", width=640, height=480, class_names=CLASSES,
+        boxes=np.tile([10.0, 10, 50, 50], (len(ids), 1)), scores=np.ones(len(ids), np.float32),
+        class_ids=np.zeros(len(ids), np.int32), ids=np.array(ids, np.int64),
+        visible=np.full(len(ids), visible, np.float32), pixel_counts=np.full(len(ids), 900, np.int64),
+    )  # fmt: skip
 
 
 def robot(stamp: int, frame: str, x: float) -> Odometry:
     return Odometry(stamp=stamp, frame=frame, child_frame="base", position=[x, 0, 0], orientation=[0, 0, 0, 1])
 
 
-def scored(mine: list[Node], relations: list[tuple[int, str, int]], offset: float = 0.0, **more: Any) -> dict[str, Any]:
+def scored(
+    mine: list[Thing], relations: list[tuple[int, str, int]], offset: float = 0.0, **more: Any
+) -> dict[str, Any]:
     """The graph's frame begins `offset` along every axis of the world; the robot says so."""
     stamps = [SECOND * (k + 1) for k in range(6)]
     true = [TABLE, BOX, FAR]
@@ -81,7 +62,7 @@ def scored(mine: list[Node], relations: list[tuple[int, str, int]], offset: floa
 
 
 def test_a_right_graph_in_a_frame_of_its_own_scores_one() -> None:
-    figures = scored([(7, 1, TABLE[2], TABLE[3]), (8, 0, BOX[2], BOX[3])], [(8, "on", 7)], offset=3.0)
+    figures = scored([(7, "table", TABLE[2], TABLE[3]), (8, "box", BOX[2], BOX[3])], [(8, "on", 7)], offset=3.0)
     assert figures == {
         "graphs": 6,
         "objects": 2,
@@ -95,11 +76,11 @@ def test_a_right_graph_in_a_frame_of_its_own_scores_one() -> None:
 
 def test_a_double_and_a_false_relation_count_and_what_was_never_seen_does_not() -> None:
     beside = (2.25, 0.0, 0.9)
-    nodes: list[Node] = [
-        (7, 1, TABLE[2], TABLE[3]),
-        (8, 0, BOX[2], BOX[3]),
-        (9, 0, beside, BOX[3]),
-        (10, 0, (9.1, 9.0, 0.1), BOX[3]),
+    nodes: list[Thing] = [
+        (7, "table", TABLE[2], TABLE[3]),
+        (8, "box", BOX[2], BOX[3]),
+        (9, "box", beside, BOX[3]),
+        (10, "box", (9.1, 9.0, 0.1), BOX[3]),
     ]
     figures = scored(nodes, [(8, "on", 7), (9, "on", 7)])
     assert figures["doubles"] == 1
@@ -112,14 +93,14 @@ def test_a_double_and_a_false_relation_count_and_what_was_never_seen_does_not() 
     ("images", "objects", "recall"), [(5, 2, 0.5), (7, 0, 0.0)], ids=["plainly seen", "hardly seen"]
 )
 def test_objects_count_that_were_plainly_seen(images: int, objects: int, recall: float) -> None:
-    figures = scored([(7, 1, TABLE[2], TABLE[3])], [], images=images)
+    figures = scored([(7, "table", TABLE[2], TABLE[3])], [], images=images)
     assert (figures["objects"], figures["node_recall"]) == (objects, recall)
     assert figures["node_precision"] == (1.0 if objects else 0.0)
 
 
 def test_a_robot_in_another_frame_than_its_graph_is_refused() -> None:
     with pytest.raises(OperatorFailure, match="the robot is in 'map', its graph in 'odom'"):
-        scored([(7, 1, TABLE[2], TABLE[3])], [], frame="map")
+        scored([(7, "table", TABLE[2], TABLE[3])], [], frame="map")
 
 
 def test_scores_load_nothing_of_what_a_map_needs() -> None:

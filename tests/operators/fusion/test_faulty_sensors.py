@@ -161,7 +161,6 @@ def test_a_first_place_far_from_the_origin_waits_for_a_second_that_agrees() -> N
     drive = Drive(4.0)
     fixes = drive.fixes(off)
     wrong = fixes[3][2]
-    assert isinstance(wrong, Pose)
     fixes[3] = (*fixes[3][:2], wrong.replace(position=wrong.position + np.array([0.0, 300.0, 0.0])))
     run = Run(drive, fixes, off=off)
     assert run.errors.max() < 1.5
@@ -329,7 +328,6 @@ def test_a_base_on_wheels_that_lies_on_its_side_by_gravity_is_warned_of_at_once(
     operator.setup()
     statuses = list[tuple[float, bool]]()
     for now, _, imu in drive.imu:
-        assert isinstance(imu, Imu)
         imu = imu.replace(
             angular_velocity=imu.angular_velocity[axes], linear_acceleration=imu.linear_acceleration[axes]
         )
@@ -357,7 +355,6 @@ def test_alarms_and_doubts_come_back_from_a_snapshot() -> None:
     other.setup()
     other.restore(one.snapshot() or {})
     assert one.state.filter is not None
-    assert other.state.filter is not None
     assert other.state.filter.health["robot/fix"].leap
     assert plain(other.state.alarms) == plain(one.state.alarms)
     assert other.summary() == one.summary()
@@ -390,14 +387,13 @@ def heading_of(drive: Drive, wrong: float, *sensors: list[Event]) -> Array:
 
 
 ABSORBED = pytest.mark.xfail(
-    strict=True,
-    reason="the accelerometer's bias explains it at first: warned after 6 s, 55 % within or warned",
+    strict=True, reason="the accelerometer's bias explains it at first: warned after 6 s, 55 % within or warned"
 )
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=ABSORBED), 1.0, -2.0, 3.1])
-def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_is_wrong(wrong: float) -> None:
+def test_a_wrong_first_heading_is_warned_of_within_a_second_and_as_long_as_it_is_wrong(wrong: float) -> None:
     """A second from the third position, the first that shows an acceleration: poses begin with the second."""
     told = []
     for seed in range(3):
@@ -410,7 +406,7 @@ def test_a_first_heading_told_wrongly_is_warned_of_within_a_second_and_while_it_
 
 
 @pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=pytest.mark.long)])
-def test_a_first_heading_told_wrongly_is_found_out_by_wheels(wrong: float) -> None:
+def test_a_wrong_first_heading_is_refuted_by_wheels(wrong: float) -> None:
     drive = Drive(5.0)
     time, errors, claimed, warned = heading_of(drive, wrong, drive.wheels(1.0)).T
     late = time >= time[0] + 1.0
@@ -419,10 +415,9 @@ def test_a_first_heading_told_wrongly_is_found_out_by_wheels(wrong: float) -> No
 
 
 @pytest.mark.long
-def test_a_first_heading_told_rightly_raises_no_doubt_and_costs_no_confidence() -> None:
+def test_a_right_first_heading_raises_no_doubt_and_costs_no_confidence() -> None:
     drive = Drive(6.0)
     run = Run(drive, drive.fixes(), heading_sigma=0.05)
-    assert run.operator.state.filter is not None
     assert run.operator.state.filter.hypotheses == 1
     assert not run.operator.state.filter.refuted_heading
     assert run.within(1.0, 6.0) > 0.95

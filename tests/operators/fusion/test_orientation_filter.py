@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 from scipy.spatial.transform import Rotation, Slerp
 
 from dataflow.messages import Imu, MagneticField
 from dataflow.testing import Played, play
 from operators.evaluation.orientation_metrics import differences, errors, without_mean_heading
 from operators.fusion import OrientationFilter
-from operators.fusion.orientation import Orientation, OrientationConfig
+from operators.fusion.orientation_filter import Orientation
 from operators.sources.broad_imu import read_trial
 
 RATE = 100
@@ -47,7 +48,7 @@ class Turns:
 
     def errors(self, played: Played, *, relative: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         at = np.searchsorted(self.stamps, [m.stamp for m in played["oriented"]])
-        estimates = [m.orientation for m in played["oriented"]]  # type: ignore[attr-defined]
+        estimates = [m.orientation for m in played["oriented"]]
         difference = differences(estimates, self.truth.as_quat()[at])
         return errors(without_mean_heading(difference) if relative else difference)
 
@@ -69,21 +70,21 @@ def test_without_a_field_the_inclination_is_known_and_the_heading_relative() -> 
     assert np.degrees(heading.min()) > 30
     assert np.degrees(made.errors(played, relative=True)[0].max()) < 5
     assert len(total) == len(heading)
-    assert "no magnetic field" in played["status"][0].messages[0]  # type: ignore[attr-defined]
+    assert "no magnetic field" in played["status"][0].messages[0]
 
 
 def test_status_names_rest_and_where_the_heading_comes_from() -> None:
     made = Turns(14.0)
     made.field[1200:] += [60e-6, 0.0, 0.0]  # beside iron
     played = play(OrientationFilter(), {"imu": made.imu(), "magnetic_field": made.fields()})
-    words = [(m.messages[0], int(m.levels[0])) for m in played["status"]]  # type: ignore[attr-defined]
+    words = [(m.messages[0], int(m.levels[0])) for m in played["status"]]
     disturbed = ("in motion; magnetic field disturbed: heading from the gyroscope meanwhile", 1)
     assert words[0] == disturbed  # until the field has been the same for some seconds
     assert words[-2:] == [("in motion; heading from the magnetic field", 0), disturbed]
     assert any(word.startswith("at rest; ") for word, _ in words)
     asked = play(OrientationFilter(heading="relative"), {"imu": made.imu()})["status"][-1]
-    assert asked.messages == ("in motion; heading from the gyroscope alone, as asked",)  # type: ignore[attr-defined]
-    assert asked.levels.tolist() == [0]  # type: ignore[attr-defined]
+    assert asked.messages == ("in motion; heading from the gyroscope alone, as asked",)
+    assert asked.levels.tolist() == [0]
 
 
 def test_dropped_samples_are_bridged() -> None:
@@ -113,7 +114,7 @@ def test_what_is_not_finite_is_counted_and_survived() -> None:
     played = play(operator, {"imu": samples, "magnetic_field": fields})
     figures = operator.summary()
     assert figures["ignored, sample not finite"] == figures["ignored, field not finite or zero"] == 1
-    assert np.isfinite([m.orientation for m in played["oriented"]]).all()  # type: ignore[attr-defined]
+    assert np.isfinite([m.orientation for m in played["oriented"]]).all()
 
 
 def test_a_field_in_another_frame_is_an_error() -> None:
@@ -124,40 +125,15 @@ def test_a_field_in_another_frame_is_an_error() -> None:
         operator.process(Turns(1.0).imu()[0], field)
 
 
-def test_two_plays_and_one_continued_from_a_snapshot_give_equal_bits() -> None:
+def test_restored_operator_resumes_alike() -> None:
     made = Turns(4.0)
-    streams = {"imu": made.imu(), "magnetic_field": made.fields()}
-    assert play(OrientationFilter(), streams).digests() == play(OrientationFilter(), streams).digests()
-    first, second = OrientationFilter(), OrientationFilter()
-    for operator in (first, second):
-        operator.setup()
-    pairs = list(zip(made.imu(), made.fields(), strict=True))
-    for imu, field in pairs[:250]:
-        first.process(imu, field)
-    second.restore(first.snapshot())
-    for imu, field in pairs[250:]:
-        one, other = first.process(imu, field), second.process(imu, field)
-        assert one is not None
-        assert other is not None
-        assert one["oriented"].digest() == other["oriented"].digest()
-
-
-def test_twenty_filters_give_equal_bits() -> None:
-    made = Turns(3.0)
-    found = set()
-    for _ in range(20):
-        filter = Orientation(OrientationConfig(), 1 / RATE)
-        for t, w, f, m in zip(made.stamps, made.gyro, made.accel, made.field, strict=True):
-            filter.feel(int(t), w, f)
-            filter.see(m)
-        found.add(filter.orientation(magnetic=True).tobytes())
-    assert len(found) == 1
+    assert_resumes_alike(OrientationFilter, list(zip(made.imu(), made.fields(), strict=True)), 250)
 
 
 @pytest.mark.data
 def test_broad_is_as_good_as_its_paper_says(data_dir: Path) -> None:
     trial = read_trial(data_dir / "broad_imu" / "16_undisturbed_fast_translation_B.hdf5")
-    filter = Orientation(OrientationConfig(), 1 / trial.rate)
+    filter = Orientation(1 / trial.rate)
     scored, found = trial.movement & np.isfinite(trial.orientations).all(axis=1), []
     for k in range(25_000):
         filter.feel(round(k * 1e9 / trial.rate), trial.gyroscope[k], trial.accelerometer[k])

@@ -18,7 +18,6 @@ CAMERAS = (VisualOdometry, VisualSlam)
 
 
 def sigma(sensor: DepthSensor | None, z: float) -> float:
-    assert sensor is not None
     return sensor.floor + sensor.quadratic * z * z
 
 
@@ -33,8 +32,6 @@ def test_sensors_have_the_noise_that_was_published(name: str, z: float, publishe
 @pytest.mark.parametrize("name", NAMES)
 def test_every_sensor_has_a_source_and_a_range(name: str) -> None:
     sensor = read_depth_sensor(name)
-    assert sensor is not None
-    assert sensor.range is not None
     assert len(sensor.source) > 20
     assert sensor.range[0] < sensor.range[1]
 

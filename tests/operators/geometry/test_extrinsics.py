@@ -19,11 +19,7 @@ T_depth_color = se3.exp(np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.1]))
 def transforms(parent: str, child: str, T: np.ndarray) -> Transforms:
     position, orientation = split_matrix(T)
     return Transforms(
-        stamp=0,
-        frames=(parent,),
-        child_frames=(child,),
-        translations=position[None],
-        rotations=orientation[None],
+        stamp=0, frames=(parent,), child_frames=(child,), translations=position[None], rotations=orientation[None]
     )
 
 
@@ -113,7 +109,7 @@ def test_frames_that_are_not_related_are_named() -> None:
 
 def info(**changes: object) -> CameraInfo:
     given = {"stamp": 0, "frame": "camera", "width": 4, "height": 3, "K": np.diag([5.0, 5.0, 1.0])}
-    return CameraInfo(**given | changes)  # type: ignore[arg-type]
+    return CameraInfo(**given | changes)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +139,7 @@ def test_a_transform_that_is_not_finite_is_named() -> None:
             transform_between(broken, source, target)
 
 
-def test_who_writes_into_a_transform_changes_it_for_nobody_else() -> None:
+def test_writing_into_a_returned_transform_does_not_change_the_cached_one() -> None:
     extrinsics = transforms("depth", "color", T_depth_color)
     transform_between(extrinsics, "color", "depth")[:] = 0
     again = transforms("depth", "color", T_depth_color)  # another message of the same value

@@ -13,7 +13,7 @@ EXTENT = st.integers(8, 400)
 
 @settings(max_examples=60, deadline=None)
 @given(st.tuples(EXTENT, EXTENT), st.tuples(EXTENT, EXTENT), st.sampled_from(["stretch", "letterbox"]))
-def test_the_image_as_a_box_comes_back_whole(image, target, mode) -> None:  # type: ignore[no-untyped-def]
+def test_the_image_as_a_box_comes_back_whole(image, target, mode) -> None:
     fit = Fit.plan(mode, image, target)
     (x, y), (width, height) = fit.offset, fit.inner
     assert min(x, y) >= 0

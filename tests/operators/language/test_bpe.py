@@ -6,10 +6,9 @@ import gzip
 from pathlib import Path
 
 import pytest
-from made_towers import write_merges
 
 from operators.inference import ModelError
-from operators.language import Tokenizer
+from operators.language.bpe import Tokenizer
 
 
 @pytest.fixture
@@ -69,8 +68,3 @@ def test_a_compressed_file_is_read_and_another_refused(merges: Path, tmp_path: P
         (tmp_path / "other").write_bytes(content)
         with pytest.raises(ModelError, match="other is no list of merges of a tokenizer"):
             Tokenizer(tmp_path / "other")
-
-
-def test_words_of_the_made_network_are_one_token(tmp_path: Path) -> None:
-    made = Tokenizer(write_merges(tmp_path / "m.txt"))(["red green blue"])[0]
-    assert (made != 0).sum() == 5

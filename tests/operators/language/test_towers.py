@@ -9,7 +9,8 @@ import pytest
 from made_towers import SIDE, write_image_tower, write_merges, write_text_tower
 
 from operators.inference import ModelError
-from operators.language import ImageTower, TextTower
+from operators.language.image_tower import ImageTower
+from operators.language.text_tower import TextTower
 
 pytest.importorskip("onnx")
 

@@ -47,7 +47,7 @@ def localized(drive: Drive, sensors: dict[str, Any], **params: Any) -> tuple[Pla
 
 
 def off(drive: Drive, played: Played) -> list[float]:
-    return [float(np.hypot(*(p.position[:2] - drive.pose(p.stamp * 1e-9)[:2]))) for p in played["pose"]]  # type: ignore[attr-defined]
+    return [float(np.hypot(*(p.position[:2] - drive.pose(p.stamp * 1e-9)[:2]))) for p in played["pose"]]
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
@@ -57,8 +57,8 @@ def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_
     assert not played["pose"]
     assert operator.summary()["poses ambiguous"] > 80
     last = played["status"][-1]
-    assert last.messages[0] == "ambiguous: another place explains as much"  # type: ignore[attr-defined]
-    other = np.array([float(word) for word in dict(last.pairs(0))["other place"].split()])  # type: ignore[attr-defined]
+    assert last.messages[0] == "ambiguous: another place explains as much"
+    other = np.array([float(word) for word in dict(last.pairs(0))["other place"].split()])
     true = drive.pose(last.stamp * 1e-9)
     both = [true, [-true[0], -true[1], true[2] + math.pi]]
     assert min(float(np.hypot(*(other[:2] - place[:2]))) for place in both) < 0.2
@@ -131,7 +131,6 @@ def test_a_decided_pose_is_in_question_again_where_another_place_explains_more(
         assert better is None
         assert competing.decided
     else:
-        assert better is not None
         assert taken <= within
         np.testing.assert_allclose(better[:, :2].mean(axis=0), TwoPlaces.there[:2], atol=0.2)
 

@@ -9,32 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 from made_room import Drive, mounts, room
+from operator_runs import assert_resumes_alike
 
-from dataflow.messages import (
-    Boxes3D,
-    LandmarkSightings,
-    LaserScan,
-    NavSatFix,
-    OccupancyGrid,
-    PointCloud,
-    Pose,
-)
+from dataflow.messages import Boxes3D, LandmarkSightings, LaserScan, NavSatFix, PointCloud, Pose
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.testing import Played, play
 from operators.localization import ParticleFilterLocalizer
 from operators.localization.map_file import read_map, write_map
 
 
-def localized(drive: Drive, sensors: dict[str, Any], **params: Any) -> tuple[Played, ParticleFilterLocalizer]:
+def localized(
+    drive: Drive, sensors: dict[str, Any], given: dict[str, Any] | None = None, **params: Any
+) -> tuple[Played, ParticleFilterLocalizer]:
+    """Plays a drive's odometry and sensors with its maps, or with others `given` in their place."""
     operator = ParticleFilterLocalizer(**{"modality_particles": 0, **params})
-    streams = {
-        "odometry": drive.odometry(),
-        "measurements": sensors,
-        "map": [drive.grid],
-        "landmark_map": [drive.landmark_map()],
-        "extrinsics": [mounts()],
-    }
-    return play(operator, streams, static=("map", "landmark_map", "extrinsics"), paranoid=False), operator
+    maps = {"map": [drive.grid], "landmark_map": [drive.landmark_map()], "extrinsics": [mounts()], **(given or {})}
+    static = [name for name in maps if name != "odometry"]
+    streams = {"odometry": drive.odometry(), "measurements": sensors, **maps}
+    return play(operator, streams, static=static, paranoid=False), operator
 
 
 def chairs(centers: Any, stamp: int, frame: str) -> Boxes3D:
@@ -100,15 +92,10 @@ def test_landmarks_without_identity_and_positions_localize_too() -> None:
 def test_a_landmark_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: float, known: bool) -> None:
     drive = Drive(3.0)
     whole = drive.landmark_map()
-    assert whole.positions is not None
     positions = whole.positions.copy()
     positions[0] = wrong
-    operator = ParticleFilterLocalizer(modality_particles=0)
-    given = {
-        "odometry": drive.odometry(), "measurements": {"scan": drive.scans(), "seen": drive.sightings(known=known)},
-        "map": [drive.grid], "landmark_map": [whole.replace(positions=positions)], "extrinsics": [mounts()],
-    }  # fmt: skip
-    played = play(operator, given, static=("map", "landmark_map", "extrinsics"))
+    sensors = {"scan": drive.scans(), "seen": drive.sightings(known=known)}
+    played, _ = localized(drive, sensors, {"landmark_map": [whole.replace(positions=positions)]})
     assert errors(drive, played["pose"], since=2.0)[0] < 0.1
 
 
@@ -174,22 +161,14 @@ def test_a_gyroscope_makes_up_for_wheels_that_slip() -> None:
 
 
 @pytest.mark.long
-def test_two_plays_give_the_same_digests_and_so_does_one_that_was_interrupted() -> None:
+def test_restored_operator_resumes_alike() -> None:
     drive = Drive(3.0)
-    sensors = {"scan": drive.scans(), "seen": drive.sightings()}
-    first, operator = localized(drive, sensors, modality_particles=100)
-    second, _ = localized(drive, sensors, modality_particles=100)
-    assert first.digests() == second.digests()
-    state = operator.snapshot()
-    assert state is not None
-    other = ParticleFilterLocalizer(modality_particles=100)
-    other.setup()
-    other.restore(state)
-    for filter in (operator, other):
-        filter.seed_rng(5)
-        filter.state.fused.move(np.array([0.1, 0.0, 0.1]), np.eye(3) * 1e-4, filter.rng)
-    assert np.array_equal(operator.state.fused.cloud()[0], other.state.fused.cloud()[0])
-    assert operator.summary() == other.summary()
+    around = mounts(), drive.grid, drive.landmark_map()
+    measured = [("scan", m) for m in drive.scans()] + [("seen", m) for m in drive.sightings()]
+    firings: list[Any] = [(m.stamp, (None, {f"measurements/{name}": m}, *around)) for name, m in measured]
+    firings += [(m.stamp, (m, {}, *around)) for m in drive.odometry()]
+    firings = [given for _, given in sorted(firings, key=lambda firing: firing[0])]
+    assert_resumes_alike(lambda: ParticleFilterLocalizer(modality_particles=100), firings, len(firings) // 2)
 
 
 def test_the_number_of_particles_follows_the_spread() -> None:
@@ -203,12 +182,7 @@ def test_what_cannot_be_used_is_counted_with_its_reason() -> None:
     drive = Drive(1.0)
     empty = PointCloud(stamp=100_000_000, frame="base_link", points=np.full((20, 3), np.nan))
     strange = LandmarkSightings(
-        stamp=200_000_000,
-        frame="base_link",
-        ids=[99],
-        ranges=[1.0],
-        bearings=[0.0],
-        covariances=[np.eye(2) * 0.01],
+        stamp=200_000_000, frame="base_link", ids=[99], ranges=[1.0], bearings=[0.0], covariances=[np.eye(2) * 0.01]
     )
     _, operator = localized(drive, {"points": [empty], "seen": [strange]})
     assert operator.summary()["ignored, measurements/points: fewer than 8 points in the band"] == 1
@@ -258,15 +232,8 @@ def test_an_object_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: 
         seen.append(chairs(at, stamp=scan.stamp, frame="base_link"))
     digests = []
     for known in (places, places[:2]):
-        operator = ParticleFilterLocalizer(modality_particles=0)
-        streams = {
-            "odometry": drive.odometry(),
-            "measurements": {"scan": drive.scans(), "objects": seen},
-            "map": [drive.grid],
-            "object_map": [chairs(known, stamp=0, frame="world")],
-            "extrinsics": [mounts()],
-        }
-        played = play(operator, streams, static=("map", "object_map", "extrinsics"), paranoid=False)
+        object_map = chairs(known, stamp=0, frame="world")
+        played, _ = localized(drive, {"scan": drive.scans(), "objects": seen}, {"object_map": [object_map]})
         assert errors(drive, played["pose"])[0] < 0.1
         digests.append(played.digests())
     assert digests[0] == digests[1]
@@ -279,14 +246,7 @@ def test_odometry_and_rates_that_are_not_finite_or_late_are_counted_and_the_robo
         odometry[k] = odometry[k].replace(position=[math.nan, 0, 0])
     gyro: list[Any] = drive.gyro()
     gyro[100] = gyro[100].replace(angular_velocity=[0, 0, math.nan])
-    operator = ParticleFilterLocalizer(modality_particles=0)
-    streams = {
-        "odometry": odometry,
-        "measurements": {"scan": drive.scans(), "imu": gyro},
-        "map": [drive.grid],
-        "extrinsics": [mounts()],
-    }
-    played = play(operator, streams, static=("map", "extrinsics"), paranoid=False)
+    played, operator = localized(drive, {"scan": drive.scans(), "imu": gyro}, {"odometry": odometry})
     assert operator.summary()["ignored, odometry: not finite"] == 3
     assert operator.summary()["ignored, measurements/imu: not finite"] == 1
     far, turned, count = errors(drive, played["pose"])
@@ -330,10 +290,7 @@ def test_a_saved_map_localizes_as_the_stream_does(tmp_path: Path) -> None:
     drive = Drive(3.0)
     write_map(drive.grid, tmp_path / "room.yaml")
     assert np.array_equal(read_map(tmp_path / "room.yaml", "world").cells, drive.grid.cells)
-    operator = ParticleFilterLocalizer(map_file=str(tmp_path / "room.yaml"), modality_particles=0)
-    sensors = {"scan": drive.scans()}
-    streams = {"odometry": drive.odometry(), "measurements": sensors, "extrinsics": [mounts()]}
-    played = play(operator, streams, static=("extrinsics",), paranoid=False)
+    played, _ = localized(drive, {"scan": drive.scans()}, {"map": []}, map_file=str(tmp_path / "room.yaml"))
     assert errors(drive, played["pose"])[0] < 0.1
 
 
@@ -344,10 +301,7 @@ def test_a_turned_map_is_looked_up_in_its_own_axes() -> None:
     turned = drive.grid.replace(
         position=np.array([*(R @ drive.grid.position[:2]), 0.0]), orientation=quaternion_from_yaw(a)
     )
-    assert isinstance(turned, OccupancyGrid)
-    operator = ParticleFilterLocalizer(modality_particles=0)
-    streams = {"odometry": drive.odometry(), "measurements": {"scan": drive.scans()}, "map": [turned]}
-    played = play(operator, {**streams, "extrinsics": [mounts()]}, static=("map", "extrinsics"), paranoid=False)
+    played, _ = localized(drive, {"scan": drive.scans()}, {"map": [turned]})
     last = played["pose"][-1]
     true = drive.pose(last.stamp * 1e-9)
     assert np.hypot(*(R.T @ last.position[:2] - true[:2])) < 0.1

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.messages import Diagnostics, OccupancyGrid, Rooms
+from dataflow.messages import OccupancyGrid, Rooms
 from dataflow.testing import play
 from operators.mapping import RoomSegmenter
 
@@ -107,7 +108,7 @@ def test_unknown_space_is_no_wall() -> None:
     assert only(half_seen).count == 1
 
 
-def test_a_wide_opening_parts_no_rooms_and_a_gap_that_nobody_passes_is_no_door() -> None:
+def test_a_wide_opening_is_no_door_nor_is_a_gap_too_narrow_to_pass() -> None:
     two = FloorPlan(9.5, 6.5).rooms(LEFT, RIGHT)
     assert only(two.fill((4.5, 3.0, 4.6, 4.6), 0)).count == 1  # 1.6 m
     narrow = only(FloorPlan(9.5, 6.5).rooms(LEFT, RIGHT).fill((4.5, 3.0, 4.6, 3.3), 0))  # 0.3 m
@@ -174,8 +175,6 @@ def test_a_map_without_free_floor_has_no_rooms_and_is_warned_of(cells: np.ndarra
     grid = OccupancyGrid(stamp=1, frame="map", resolution=SIDE, cells=cells.astype(np.int8), position=[0, 0, 0])
     played = play(RoomSegmenter(), {"map": [grid]})
     (rooms,), (status,) = played["rooms"], played["status"]
-    assert isinstance(rooms, Rooms)
-    assert isinstance(status, Diagnostics)
     assert rooms.count == 0
     assert (status.levels.tolist(), status.messages) == ([1], ("the map has no room: no free floor is known",))
 
@@ -185,18 +184,9 @@ def test_a_narrowest_door_above_the_widest_is_refused() -> None:
         only(flat(), narrowest=1.5)
 
 
-def test_two_plays_are_equal_and_a_restored_segmenter_goes_on_the_same() -> None:
+def test_restored_operator_resumes_alike() -> None:
     maps = [FloorPlan(5.0, 4.5, corner=(4.5, 1.9)).rooms(RIGHT).at(0), flat().at(3), flat().at(6)]
-    whole, again = (play(RoomSegmenter(), {"map": maps}) for _ in range(2))
-    assert whole.digests() == again.digests()
-    first, second = RoomSegmenter(), RoomSegmenter()
-    for operator in (first, second):
-        operator.setup()
-    first.process(maps[0])
-    snapshot = first.snapshot()
-    assert snapshot is not None
-    second.restore(snapshot)
-    assert [second.process(m)["rooms"] for m in maps[1:]] == whole["rooms"][1:]
+    assert_resumes_alike(RoomSegmenter, [(each,) for each in maps], 1)
 
 
 @pytest.mark.parametrize("clear", [0.7, 0.83, 1.0])

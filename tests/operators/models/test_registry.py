@@ -56,7 +56,7 @@ def test_every_row_fits_its_operator(model: Model) -> None:
 
 def test_a_file_of_ones_own_adds_rows_and_hides_those_of_the_same_name(named: Path) -> None:
     named.write_text(ROW.replace("crates:", "yolox_nano:"))
-    registry = Registry.load.__func__(Registry)  # type: ignore[attr-defined]
+    registry = Registry.load.__func__(Registry)
     assert registry["yolox_nano"].about == "crates and pallets"
     assert "yolox_tiny" in registry
 

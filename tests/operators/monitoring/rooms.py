@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dataflow import Played
 from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
+from dataflow.messages.diagnostics import Level
 
 Array = NDArray[np.float64]
 K = np.array([[272.0, 0, 159.5], [0, 272.0, 119.5], [0, 0, 1.0]])
@@ -88,3 +90,8 @@ def views(count: int, scale: float = 1.0, seed: int = 3) -> Iterator[tuple[Depth
 
 def info(frame: str) -> CameraInfo:
     return CameraInfo(stamp=0, frame=frame, width=WIDTH, height=HEIGHT, K=K)
+
+
+def warnings(played: Played) -> list[str]:
+    """What is warned of, in order."""
+    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]

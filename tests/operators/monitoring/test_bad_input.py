@@ -84,32 +84,24 @@ def test_scans_with_a_velocity_that_is_not_finite_are_counted_and_raise_no_alarm
     timed = [c.replace(time_offsets=np.full(c.count, 0.01, np.float32)) for c in clouds]
     motion = [
         Odometry.from_matrix(
-            np.eye(4),
-            stamp=c.stamp,
-            frame="odom",
-            child_frame="lidar",
+            np.eye(4), stamp=c.stamp, frame="odom", child_frame="lidar", angular=[0, 0, 0],
             linear=[np.nan if k in BAD else 0, 0, 0],
-            angular=[0, 0, 0],
         )
         for k, c in enumerate(clouds)
-    ]
+    ]  # fmt: skip
     played = scans_checked(timed, depths, motion=motion)
     assert_no_alarm(played, len(clouds))
     assert played["status"][-1].pairs(0)["with few common surfaces"] == str(len(BAD))
 
 
-def test_calibrations_of_another_size_are_named() -> None:
+def test_calibrations_of_another_size_and_frames_that_no_transform_relates_are_named() -> None:
     depths, images, clouds = room()
     small = [d.replace(data=d.data[:120, :160]) for d in depths]
-    with pytest.raises(OperatorFailure, match="depth has 160x120 pixels, but depth_info describes 320x240"):
-        colors_checked(images, small)
-    with pytest.raises(OperatorFailure, match="depth has 160x120 pixels, but depth_info describes 320x240"):
-        scans_checked(clouds, small)
-
-
-def test_sensors_that_no_transform_relates_are_named() -> None:
-    depths, images, clouds = room()
-    with pytest.raises(OperatorFailure, match="'mast'"):
-        colors_checked([i.replace(frame="mast") for i in images], depths)
-    with pytest.raises(OperatorFailure, match="'mast'"):
-        scans_checked([c.replace(frame="mast") for c in clouds], depths)
+    masts, high = [i.replace(frame="mast") for i in images], [c.replace(frame="mast") for c in clouds]
+    size = "depth has 160x120 pixels, but depth_info describes 320x240"
+    for check, given, text in (
+        (colors_checked, (images, small), size), (scans_checked, (clouds, small), size),
+        (colors_checked, (masts, depths), "'mast'"), (scans_checked, (high, depths), "'mast'"),
+    ):  # fmt: skip
+        with pytest.raises(OperatorFailure, match=text):
+            check(*given)

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from repeated import assert_repeats
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Image, Transforms
@@ -16,7 +17,7 @@ from dataflow.messages.diagnostics import Level
 from operators.geometry.extrinsics import transform_between
 from operators.monitoring import ColorDepthCheck
 from operators.monitoring.edge_alignment import EdgeAlignment, rims
-from tests.operators.monitoring.rooms import K, extrinsics, info, views
+from tests.operators.monitoring.rooms import K, extrinsics, info, views, warnings
 
 
 @cache
@@ -31,25 +32,18 @@ def checked(known: Transforms) -> Played:
     return play(ColorDepthCheck(period="200ms"), {"image": images, "depth": depths} | infos, static=list(infos))
 
 
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
-
-
 def test_cameras_that_fit_raise_no_alarm() -> None:
-    played = checked(extrinsics())
-    assert len(played["status"]) == 16
-    assert warnings(played) == []
+    assert [s.levels[0] for s in checked(extrinsics())["status"]] == [Level.OK] * 16
+    assert finding(ColorDepthCheck(period="200ms", calibrate=True), extrinsics())[0] == ""
 
 
 @pytest.mark.parametrize(
     ("axis", "angle", "right", "below"), [("y", 3.0, 3, 0), ("y", -3.0, -3, 0), ("x", 3.0, 0, -3), ("x", -3.0, 0, 3)]
 )
-def test_a_turned_camera_is_said_with_the_angle(axis: str, angle: float, right: float, below: float) -> None:
+def test_a_turned_camera_is_warned_of_with_the_angle(axis: str, angle: float, right: float, below: float) -> None:
     said = warnings(checked(extrinsics(color=(axis, angle))))
     assert len(said) >= 5
-    told = re.search(r"lies (\S+)° right and (\S+)° below", said[-1])
-    assert told is not None
-    assert [float(each) for each in told.groups()] == pytest.approx([right, below], abs=0.6)
+    assert figures(r"lies (\S+)° right and (\S+)° below", said[-1]) == pytest.approx([right, below], abs=0.6)
 
 
 def test_the_shift_is_that_of_the_image() -> None:
@@ -61,7 +55,7 @@ def test_the_shift_is_that_of_the_image() -> None:
     assert whole.off(3)
 
 
-def test_images_without_edges_say_nothing() -> None:
+def test_images_without_edges_give_no_shift() -> None:
     alignment = EdgeAlignment()
     _, depths = pairs()
     alignment.add(np.full((240, 320, 3), 90, np.uint8), K, rims(depths[0].data, K))
@@ -78,19 +72,10 @@ def test_rims_are_pixels_in_front_of_something() -> None:
     assert set(rims(depth, K)[:, 2]) == {1.0}
 
 
-def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
-    images, depths = pairs()
-    first, second = ColorDepthCheck(), ColorDepthCheck()
-    first.setup()
-    second.setup()
+def test_checks_repeat_and_a_restored_one_goes_on() -> None:
     given = (info("color"), info("depth"), extrinsics(color=("y", 3.0)))
-    for k in range(0, 6, 2):
-        first.process(images[k], depths[k], *given)
-    second.restore(first.snapshot())
-    told = [each.process(images[6], depths[6], *given) for each in (first, second)]
-    assert told[0] is not None
-    assert told[1] is not None
-    assert told[0]["status"].digest() == told[1]["status"].digest()
+    calls = [(image, depth, *given) for image, depth in zip(*pairs(), strict=True)]
+    assert_repeats(ColorDepthCheck, calls[:8:2], 3)
 
 
 def displaced(metres: float) -> Transforms:
@@ -102,14 +87,41 @@ def displaced(metres: float) -> Transforms:
 
 
 def finding(operator: ColorDepthCheck, known: Transforms) -> tuple[str, list[Transforms]]:
-    """Returns what is found over the views, and the corrected extrinsics."""
+    """What is found over the views, and the corrected extrinsics."""
     operator.setup()
-    given = []
-    for image, depth in zip(*pairs(), strict=True):
-        made = operator.process(image, depth, info("color"), info("depth"), known)
-        if made is not None and isinstance(corrected := made.get("corrected"), Transforms):
-            given.append(corrected)
-    return operator.finding(), given
+    seen = zip(*pairs(), strict=True)
+    made = [operator.process(image, depth, info("color"), info("depth"), known) or {} for image, depth in seen]
+    return operator.finding(), [each["corrected"] for each in made if "corrected" in each]
+
+
+def figures(pattern: str, text: str) -> list[float]:
+    told = re.search(pattern, text)
+    assert told is not None, text
+    return [float(each) for each in told.groups()]
+
+
+def test_a_displaced_or_turned_camera_is_found_with_what_puts_it_right_where_it_is_sure() -> None:
+    text, given = finding(ColorDepthCheck(period="200ms"), displaced(-0.08))
+    assert figures(r"with the colour camera (\S+) cm to the right and (\S+) cm down", text) == pytest.approx(
+        [8, 0], abs=2
+    )
+    assert given == []
+    text, _ = finding(ColorDepthCheck(period="200ms"), extrinsics(color=("y", 3.0)))
+    assert figures(r"turned by (\S+)° to the right", text) == pytest.approx([-3], abs=0.6)
+    text, _ = finding(ColorDepthCheck(period="200ms"), displaced(0.05))  # a turn fits about as well
+    assert text.endswith("a camera is turned or displaced against its extrinsic")
+
+
+def test_calibration_brings_the_camera_nearer_step_by_step_and_reports_it() -> None:
+    text, given = finding(ColorDepthCheck(period="200ms", calibrate=True), displaced(0.12))
+    away = [float(np.linalg.norm(transform_between(each, "color", "depth")[:3, 3])) for each in given]
+    assert len(away) >= 2
+    assert away[0] == pytest.approx(0.12)
+    assert away[-1] < 0.07
+    assert figures(r"was put (\S+) cm to the right", text) == pytest.approx([100 * (away[-1] - away[0])], abs=0.2)
+    text, given = finding(ColorDepthCheck(period="200ms", calibrate=True), extrinsics(color=("y", -3.0)))
+    assert len(given) == 2
+    assert figures(r"turned by (\S+)° to the right", text) == pytest.approx([1.5], abs=0.4)  # half of it
 
 
 def boards(seed: int, shift: Callable[[float], float]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
@@ -141,45 +153,8 @@ def test_near_and_far_edges_tell_a_displaced_camera_from_a_turned_one(
         image, points = boards(seed, shift)
         alignment.add(image, camera, points)
     found = alignment.correction(camera)
-    assert found is not None
     assert found.displacement == pytest.approx((displacement, 0), abs=0.005)
     assert found.turn == pytest.approx((turn, 0), abs=0.005)
-
-
-def test_a_displaced_camera_is_found_with_what_puts_it_right() -> None:
-    text, given = finding(ColorDepthCheck(period="200ms"), displaced(-0.08))
-    told = re.search(r"it fits with the colour camera (\S+) cm to the right and (\S+) cm down", text)
-    assert told is not None, text
-    assert [float(each) for each in told.groups()] == pytest.approx([8, 0], abs=2)
-    assert given == []
-
-
-def test_no_remedy_is_stated_where_a_turn_fits_about_as_well() -> None:
-    text, _ = finding(ColorDepthCheck(period="200ms"), displaced(0.05))
-    assert text.endswith("a camera is turned or displaced against its extrinsic")
-
-
-def test_a_turned_camera_is_found_with_the_turn_that_puts_it_right() -> None:
-    text, _ = finding(ColorDepthCheck(period="200ms"), extrinsics(color=("y", 3.0)))
-    told = re.search(r"turned by (\S+)° to the right", text)
-    assert told is not None, text
-    assert float(told[1]) == pytest.approx(-3, abs=0.6)
-
-
-def test_cameras_that_fit_have_no_finding() -> None:
-    assert finding(ColorDepthCheck(period="200ms", calibrate=True), extrinsics())[0] == ""
-
-
-def test_calibration_brings_the_camera_nearer_step_by_step() -> None:
-    known = displaced(0.12)
-    text, given = finding(ColorDepthCheck(period="200ms", calibrate=True), known)
-    away = [float(np.linalg.norm(transform_between(each, "color", "depth")[:3, 3])) for each in given]
-    assert len(away) >= 2
-    assert away[0] == pytest.approx(0.12)
-    assert away[-1] < 0.07
-    told = re.search(r"was put (\S+) cm to the right", text)
-    assert told is not None, text
-    assert float(told[1]) == pytest.approx(100 * (away[-1] - away[0]), abs=0.2)
 
 
 def test_edges_come_nearer_where_a_turn_fits_about_as_well_as_a_displacement() -> None:
@@ -194,15 +169,6 @@ def test_edges_come_nearer_where_a_turn_fits_about_as_well_as_a_displacement() -
         off.append(abs(alignment.shifts()[0].x))
     assert off[0] >= 3
     assert off[1] <= 0.7 * off[0]
-
-
-def test_what_was_corrected_is_found_though_all_fits_since() -> None:
-    check = ColorDepthCheck(period="200ms", calibrate=True)
-    text, given = finding(check, extrinsics(color=("y", -3.0)))
-    assert len(given) == 2
-    told = re.search(r"turned by (\S+)° to the right", text)
-    assert told is not None, text
-    assert float(told[1]) == pytest.approx(1.5, abs=0.4)  # half of it
 
 
 def test_the_tree_of_the_extrinsics_stays_one_when_a_camera_is_moved() -> None:

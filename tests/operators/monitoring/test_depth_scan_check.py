@@ -6,14 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 
 from dataflow import Played, play
 from dataflow.messages import DepthImage, Odometry, PointCloud, Transforms
-from dataflow.messages.diagnostics import Level
 from operators.geometry.se3 import exp
 from operators.monitoring import DepthScanCheck
 from operators.monitoring.depth_scan import DepthScanAgreement
-from tests.operators.monitoring.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views
+from tests.operators.monitoring.rooms import T_BASE_DEPTH, T_BASE_LIDAR, K, extrinsics, info, views, warnings
 
 
 @cache
@@ -28,10 +28,6 @@ def checked(known: Transforms, scale: float = 1.0) -> Played:
     return play(DepthScanCheck(), given, static=["depth_info", "extrinsics"])
 
 
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
-
-
 def test_sensors_that_fit_raise_no_alarm() -> None:
     played = checked(extrinsics())
     assert len(played["status"]) == 14
@@ -41,7 +37,7 @@ def test_sensors_that_fit_raise_no_alarm() -> None:
 @pytest.mark.parametrize(
     ("scale", "text"), [pytest.param(1.05, "5.0% too long", marks=pytest.mark.long), (0.96, "4.0% too short")]
 )
-def test_depths_of_another_scale_are_said_with_the_scale(scale: float, text: str) -> None:
+def test_depths_of_another_scale_are_reported_with_the_scale(scale: float, text: str) -> None:
     said = warnings(checked(extrinsics(), scale))
     assert len(said) >= 8
     assert text in said[-1]
@@ -49,7 +45,7 @@ def test_depths_of_another_scale_are_said_with_the_scale(scale: float, text: str
 
 @pytest.mark.parametrize("sensor", ["depth", "lidar"])
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_a_sensor_that_is_turned_is_said_within_seconds(sensor: str, axis: str) -> None:
+def test_turned_sensor_is_reported_within_seconds(sensor: str, axis: str) -> None:
     said = warnings(checked(extrinsics(**{sensor: (axis, 3.0)})))
     assert len(said) >= 5
     assert "turned by" in said[-1]
@@ -64,14 +60,6 @@ def test_the_misfit_is_what_makes_scans_lie_on_the_depth() -> None:
     found = agreement.misfit()
     assert found.scale == pytest.approx(0.03, abs=0.003)
     assert found.turn == pytest.approx([-0.02, 0.03, -0.01], abs=0.006)
-
-
-def test_what_shows_no_common_surface_changes_nothing() -> None:
-    agreement = DepthScanAgreement()
-    T = np.linalg.inv(T_BASE_DEPTH) @ T_BASE_LIDAR
-    assert not agreement.add(np.zeros((240, 320), np.float32), K, np.ones((50, 3)), T)
-    assert not agreement.add(np.full((240, 320), 2.0, np.float32), K, np.zeros((0, 3)), T)
-    assert agreement.misfit().angle == 0
 
 
 def test_scans_with_times_are_deskewed_by_the_velocity_or_left_out() -> None:
@@ -94,13 +82,6 @@ def test_scans_with_times_are_deskewed_by_the_velocity_or_left_out() -> None:
     assert untold["status"][-1].pairs(0)["without a velocity"] == "14"
 
 
-def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
-    clouds, depths = pairs(1.05)
-    first, second = DepthScanCheck(), DepthScanCheck()
-    first.setup()
-    second.setup()
-    for cloud, depth in list(zip(clouds, depths, strict=True))[:6]:
-        first.process(cloud, depth, info("depth"), extrinsics())
-    second.restore(first.snapshot())
-    results = [each.process(clouds[6], depths[6], info("depth"), extrinsics()).digest() for each in (first, second)]
-    assert results[0] == results[1]
+def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+    calls = [(cloud, depth, info("depth"), extrinsics()) for cloud, depth in zip(*pairs(1.05), strict=True)]
+    assert_repeats(DepthScanCheck, calls[:7], 6)

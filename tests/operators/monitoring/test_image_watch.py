@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 
-from dataflow import Played, play
-from dataflow.messages import DepthImage, Diagnostics, Image
+from dataflow import play
+from dataflow.messages import DepthImage, Image
 from operators.monitoring import DepthWatch, ImageWatch
 
 
@@ -17,27 +18,19 @@ def images(*levels: int, seed: int = 1) -> list[Image]:
     return [Image(stamp=k, frame="camera", data=each) for k, each in enumerate(data)]
 
 
-def texts(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"] if isinstance(status, Diagnostics)]
-
-
 def test_new_images_pass_as_they_are() -> None:
     given = images(50, 51, 50)
     played = play(ImageWatch(), {"image": given})
     assert [m.digest() for m in played["checked"]] == [m.digest() for m in given]
 
 
-def test_an_image_that_repeats_the_last_one_is_held_back_until_it_changes() -> None:
-    played = play(ImageWatch(), {"image": images(50, 50, 50, 60)})
-    assert [m.stamp for m in played["checked"]] == [0, 3]
-    assert texts(played)[1:3] == [f"the image repeats the last one, {n} in a row" for n in (1, 2)]
-    assert [int(s.levels[0]) for s in played["status"] if isinstance(s, Diagnostics)] == [0, 1, 1, 0]
-
-
-def test_a_black_image_is_held_back() -> None:
-    played = play(ImageWatch(), {"image": images(50, 0, 60)})
-    assert [m.stamp for m in played["checked"]] == [0, 2]
-    assert "is black" in texts(played)[1]
+def test_images_that_repeat_the_last_one_or_are_black_are_held_back_until_they_change() -> None:
+    played = play(ImageWatch(), {"image": images(50, 50, 50, 60, 0, 70)})
+    assert [m.stamp for m in played["checked"]] == [0, 3, 5]
+    said = [status.messages[0] for status in played["status"]]
+    assert said[1:3] == [f"the image repeats the last one, {n} in a row" for n in (1, 2)]
+    assert "is black" in said[4]
+    assert [int(s.levels[0]) for s in played["status"]] == [0, 1, 1, 0, 1, 0]
 
 
 @pytest.mark.parametrize("kept", [0.0, 1.0, np.inf], ids=["empty", "frozen", "all infinite"])
@@ -49,11 +42,7 @@ def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
     assert [m.stamp for m in played["checked"]] == [0, 2]
 
 
-def test_a_restored_watch_goes_on_as_the_first_would_have() -> None:
-    first, second = ImageWatch(), ImageWatch()
-    first.setup()
-    second.setup()
-    given = images(50, 50)
-    first.process(given[0])
-    second.restore(first.snapshot())
-    assert first.process(given[1])["status"].digest() == second.process(given[1])["status"].digest()
+def test_watches_repeat_and_a_restored_one_knows_the_last_image() -> None:
+    first, second = assert_repeats(ImageWatch, [(each,) for each in images(50, 50)], 1)
+    assert "checked" in first
+    assert "checked" not in second

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 from scipy.spatial.transform import Rotation
 
 from dataflow import Played, play
@@ -16,6 +17,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
 from operators.geometry.se3 import exp
 from operators.monitoring import MotionCheck
+from tests.operators.monitoring.rooms import warnings
 
 SECONDS = 12
 SPEED, TURN = 0.5, 0.4
@@ -48,15 +50,9 @@ def wheels(scale: float = 1.0, still: Sequence[float] = (99, 99)) -> list[Odomet
     for k in range(0, SECONDS * 100, 5):
         moves = not still[0] <= k / 100 < still[1]
         linear, angular = np.array([SPEED, 0, 0]), np.array([0, 0, TURN * np.sin(0.008 * (k - 2.5))])
+        twist = {"linear": linear * scale * moves, "angular": angular * scale * moves}
         out.append(
-            Odometry.from_matrix(
-                np.eye(4),
-                stamp=k * 10_000_000,
-                frame="wheel_odom",
-                child_frame="base_link",
-                linear=linear * scale * moves,
-                angular=angular * scale * moves,
-            )
+            Odometry.from_matrix(np.eye(4), stamp=k * 10_000_000, frame="wheel_odom", child_frame="base_link", **twist)
         )
     return out
 
@@ -89,21 +85,15 @@ def extrinsics(sensor: str = "", axis: str = "z", angle: float = 0.0) -> Transfo
     )
 
 
-def checked(known: Transforms | None = None, **changed: Any) -> Played:
+def checked(known: Transforms | None = None, operator: MotionCheck | None = None, **changed: Any) -> Played:
+    lidar, camera = changed.get("lidar", odometry("lidar", 20, 2)), changed.get("camera", odometry("camera", 10, 1))
     given: dict[str, Any] = {
         "wheels": changed.get("wheels", wheels()),
-        "motions": {
-            "camera": changed.get("camera", odometry("camera", 10, 1)),
-            "lidar": changed.get("lidar", odometry("lidar", 20, 2)),
-        },
+        "motions": {name: stream for name, stream in (("camera", camera), ("lidar", lidar)) if stream is not None},
         "imu": {"imu": changed.get("imu", gyroscope())},
         "extrinsics": [known or extrinsics()],
     }
-    return play(MotionCheck(), given, static=["extrinsics"])
-
-
-def warnings(played: Played) -> list[str]:
-    return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]
+    return play(operator or MotionCheck(), given, static=["extrinsics"])
 
 
 def test_sensors_that_agree_raise_no_alarm_and_wheels_pass_as_they_are() -> None:
@@ -113,13 +103,21 @@ def test_sensors_that_agree_raise_no_alarm_and_wheels_pass_as_they_are() -> None
     assert [m.digest() for m in played["checked"]] == [m.digest() for m in wheels()]
 
 
-def test_wheels_of_another_radius_are_named_and_held_back() -> None:
-    played = checked(wheels=wheels(1.05))
-    assert warnings(played)[-1].startswith("wheels: 4.9% more way than")
-    assert len(played["checked"]) < 0.5 * len(wheels())
+@pytest.mark.parametrize(
+    ("name", "changed", "said"),
+    [
+        ("wheels", wheels(1.05), "wheels: 4.9% more way than motions/camera and motions/lidar"),
+        ("camera", odometry("camera", 10, 1, 1.05), "motions/camera: 4.9% more way than motions/lidar and wheels"),
+        ("imu", gyroscope(1.06), "gyroscope of imu: 5.8% more turning than"),
+    ],
+)
+def test_sensor_of_another_scale_is_reported_and_wheels_are_held_back(name: str, changed: Any, said: str) -> None:
+    played = checked(**{name: changed})
+    assert warnings(played)[-1].startswith(said)
+    assert (len(played["checked"]) < 0.5 * len(wheels())) == (name == "wheels")
 
 
-def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once_and_only_then() -> None:
+def test_wheels_at_rest_on_a_moving_robot_are_held_back_at_once_and_only_then() -> None:
     given = wheels(still=(4.0, 6.0))
     played = checked(wheels=given)
     late = [m.stamp * 1e-9 for m in given if 4.3 <= m.stamp * 1e-9 < 6.0]
@@ -130,14 +128,8 @@ def test_wheels_that_say_they_stand_while_the_robot_drives_are_held_back_at_once
     assert int(played["status"][-1].levels[0]) == Level.OK
 
 
-def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
-    said = warnings(checked(camera=odometry("camera", 10, 1, scale=1.05)))
-    assert said[-1].startswith("motions/camera: 4.9% more way than")
-    assert "motions/lidar and wheels" in said[-1]
-
-
 @pytest.mark.parametrize("sensor", [pytest.param("wheels", marks=pytest.mark.long), "imu"])
-def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_not(sensor: str) -> None:
+def test_sensor_that_repeats_a_reading_of_motion_is_reported_and_one_at_rest_is_not(sensor: str) -> None:
     given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
     held = next(m for m in given if m.stamp >= 6_000_000_000)
     hung = [held.replace(stamp=m.stamp) if 6 <= m.stamp * 1e-9 < 7.5 else m for m in given]
@@ -149,11 +141,6 @@ def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_no
         m.replace(position=np.zeros(3), orientation=np.array([0, 0, 0, 1.0])) for m in odometry("camera", 10, 1)
     ]
     assert not warnings(checked(wheels=resting, camera=standing, lidar=[], imu=[]))
-
-
-def test_a_gyroscope_of_another_scale_is_named() -> None:
-    said = warnings(checked(imu=gyroscope(1.06)))
-    assert said[-1].startswith("gyroscope of imu: 5.8% more turning than")
 
 
 @pytest.mark.parametrize(
@@ -177,48 +164,28 @@ def test_readings_that_are_not_finite_are_counted_and_left_out(wrong: float) -> 
     turned[500] = turned[500].replace(angular_velocity=[wrong, 0, 0])
     carried[50] = carried[50].replace(position=[wrong, 0, 0])
     operator = MotionCheck()
-    given: dict[str, Any] = {
-        "wheels": driven,
-        "motions": {"camera": carried, "lidar": odometry("lidar", 20, 2)},
-        "imu": {"imu": turned},
-        "extrinsics": [extrinsics()],
-    }
-    played = play(operator, given, static=["extrinsics"])
+    played = checked(operator=operator, wheels=driven, camera=carried, imu=turned)
     assert warnings(played) == []
     assert [m.stamp for m in played["checked"]] == [m.stamp for m in driven if m is not driven[40]]
     counted = {name: n for name, n in operator.summary().items() if "not finite" in name}
     assert counted == {"gyroscope of imu: not finite": 1, "motions/camera: not finite": 1, "wheels: not finite": 1}
 
 
-def test_of_two_nobody_knows_which_is_wrong_and_wheels_still_pass() -> None:
-    given = {
-        "wheels": wheels(1.05),
-        "motions": {"lidar": odometry("lidar", 20, 2)},
-        "extrinsics": [extrinsics()],
-    }
-    played = play(MotionCheck(), given, static=["extrinsics"])
+def test_of_two_it_is_open_which_is_wrong_and_wheels_still_pass() -> None:
+    played = checked(wheels=wheels(1.05), camera=None, imu=[])
     assert warnings(played)[-1].startswith("motions/lidar: ")
     assert len(played["checked"]) == len(wheels())
 
 
-def test_a_restored_check_goes_on_as_the_first_would_have() -> None:
-    first, second = MotionCheck(), MotionCheck()
-    first.setup()
-    given = {"wheels": wheels(1.05), "camera": odometry("camera", 10, 1), "lidar": odometry("lidar", 20, 2)}
+def test_checks_repeat_and_a_restored_one_goes_on() -> None:
     by_stamp: dict[int, dict[str, Odometry]] = {}
-    for name, messages in given.items():
+    for name, messages in (
+        ("wheels", wheels(1.05)), ("camera", odometry("camera", 10, 1)), ("lidar", odometry("lidar", 20, 2)),
+    ):  # fmt: skip
         for message in messages:
             by_stamp.setdefault(message.stamp, {})[name] = message
-
-    def fed(check: MotionCheck, stamp: int) -> list[bytes]:
-        now = by_stamp[stamp]
+    calls = []
+    for stamp, now in sorted(by_stamp.items())[:160]:
         motions = {f"robot/motions/{name}": m for name, m in now.items() if name != "wheels"}
-        made = check.process(SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics())  # type: ignore[arg-type]
-        return [made[name].digest() for name in sorted(made)]
-
-    stamps = sorted(by_stamp)
-    for stamp in stamps[:100]:
-        fed(first, stamp)
-    second.setup()
-    second.restore(first.snapshot())
-    assert [fed(first, s) for s in stamps[100:160]] == [fed(second, s) for s in stamps[100:160]]
+        calls.append((SimpleNamespace(stamp=stamp), now.get("wheels"), motions, (), extrinsics()))
+    assert_repeats(MotionCheck, calls, 100)

@@ -15,7 +15,7 @@ from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.stereo.adjustment import StereoRig
 from operators.odometry.stereo.settings import StereoOdometryConfig
 
-EYE = np.eye(3)
+EYE, MIRROR = np.eye(3), np.diag([1.0, 1.0, -1.0, 1.0])
 
 
 def without(row: int, column: int) -> np.ndarray:
@@ -54,6 +54,16 @@ def without(row: int, column: int) -> np.ndarray:
         (MonoOdometry, {"K": EYE}, {"K": EYE * np.nan}),
         (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": EYE, "K_depth": EYE[:2]}),
         (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": EYE + np.inf, "K_depth": EYE}),
+        (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": np.eye(4), "K_depth": EYE}),
+        (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": without(0, 0), "K_depth": EYE}),
+        (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": without(1, 1), "K_depth": EYE}),
+        (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": np.diag([-1.0, 1.0, 1.0]), "K_depth": EYE}),
+        (
+            RgbdCamera,
+            {"K_color": EYE, "K_depth": EYE},
+            {"K_color": EYE, "K_depth": EYE, "T_depth_color": 2 * np.eye(4)},
+        ),
+        (RgbdCamera, {"K_color": EYE, "K_depth": EYE}, {"K_color": EYE, "K_depth": EYE, "T_depth_color": MIRROR}),
     ],
 )
 def test_the_least_is_allowed_and_less_is_refused(make: Any, least: dict[str, Any], less: dict[str, Any]) -> None:
@@ -74,4 +84,4 @@ def test_one_odometry_is_of_one_calibration() -> None:
         (camera, RgbdCamera(EYE, 2 * EYE, moved)),
     ]:  # fmt: skip
         with pytest.raises(ValueError, match="the calibration changed"):
-            known.check_same(other)  # type: ignore[arg-type]
+            known.check_same(other)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_books import BOOKS
 
 import dataflow
 from dataflow.messages import CameraInfo, Image, Message, Transforms
@@ -139,7 +140,6 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
     assert blind.pose is not None
     assert blind.cloud is None
     assert blind.graph is None
-    assert system.graph is not None
     assert system.graph.stamp < blind.stamp
 
 
@@ -158,28 +158,20 @@ def test_a_camera_whose_base_is_found_needs_no_extrinsics(room: Room) -> None:
         assert "mount" not in system.left_out
 
 
+CHOICES = {
+    "image": ({"detections", "segmentation", "tracks"}, {"lifter", "objects", "scene", "fusion", "base"}),
+    "image points": ({"detections", "cloud", "pose"}, {"odometry", "fusion", "wheeled"}),
+    "imu wheels": (set(), {"detector", "lifter", "scene", "wheeled"}),
+    "wheels command": (set(), {"fusion", "scene"}),
+}
+"""Sensors → what they give, and the operators that they leave out."""
+
+
 @pytest.mark.parametrize(
-    ("sensors", "there", "gone"),
-    [
-        pytest.param(
-            ("image",),
-            {"detections", "segmentation", "tracks"},
-            {"lifter", "objects", "scene", "fusion", "base"},
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            ("image", "points"),
-            {"detections", "cloud", "pose"},
-            {"odometry", "fusion", "wheeled"},
-            marks=pytest.mark.long,
-        ),
-        (("imu", "wheels"), set(), {"detector", "lifter", "scene", "wheeled"}),
-        pytest.param(("wheels", "command"), set(), {"fusion", "scene"}, marks=pytest.mark.long),
-    ],
-    ids=["camera", "camera_and_lidar", "inertial_and_wheels", "wheels_and_commands"],
+    "chosen", [pytest.param(n, marks=() if n == "imu wheels" else pytest.mark.long) for n in CHOICES]
 )
-def test_it_takes_what_is_there(room: Room, sensors: tuple[str, ...], there: set[str], gone: set[str]) -> None:
-    made: set[str] = set()
+def test_it_takes_what_is_there(room: Room, chosen: str) -> None:
+    sensors, (there, gone), made = tuple(chosen.split()), CHOICES[chosen], set[str]()
     with room.system(sensors) as system:
         assert gone <= system.left_out.keys()
         for stamp, step in list(room.given(*sensors))[:60]:
@@ -189,22 +181,34 @@ def test_it_takes_what_is_there(room: Room, sensors: tuple[str, ...], there: set
         assert "pose" in made
 
 
+def test_no_detection_of_a_detector_of_ones_own_is_lost(room: Room) -> None:
+    """Nothing that was trained on other objects stands between the detector and what follows."""
+    with room.system(detector_operator="made_books:BookDetector", detector_params={}, segment=False) as system:
+        for stamp, step in list(room.given("image", "depth"))[:3]:
+            result = system.process(stamp, **step)
+            np.testing.assert_array_equal(result.detections.boxes, BOOKS)
+            assert result.detections.labels() == ("book",) * len(BOOKS)
+    assert sorted(result.tracks.boxes[:, 0].round().tolist()) == BOOKS[:, 0].tolist()
+    assert set(result.tracks.labels()) == {"book"}
+
+
 def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None:
     (first, given), (second, following) = list(room.given("image", "depth"))[:2]
     image, depth = given["image"].data, given["depth"].data
+    wrong: list[tuple[type[Exception], str, int, dict[str, Any]]] = [
+        (ValueError, "image has 10x20 pixels, but image_info describes 320x240", first,
+         {"image": np.zeros((20, 10, 3), np.uint8), "depth": depth}),
+        (ValueError, "image is in frame 'other'", first, {"image": Image(stamp=first, frame="other", data=image)}),
+        (TypeError, "depth is in metres, as floating-point numbers, not uint16", first,
+         {"image": image, "depth": (depth * 1000).astype(np.uint16)}),
+        (ValueError, "made for image, depth, not for imu", first, {"imu": next(room.given("imu"))[1]["imu"]}),
+        (TypeError, "depth takes DepthImage, not Image", first, {"depth": given["image"]}),
+        (ValueError, "image has stamp", first - 1, {"image": given["image"]}),
+    ]  # fmt: skip
     with room.system() as system:
-        with pytest.raises(ValueError, match="image has 10x20 pixels, but image_info describes 320x240"):
-            system.process(first, image=np.zeros((20, 10, 3), np.uint8), depth=depth)
-        with pytest.raises(ValueError, match="image is in frame 'other'"):
-            system.process(first, image=Image(stamp=first, frame="other", data=image))
-        with pytest.raises(TypeError, match="depth is in metres, as floating-point numbers, not uint16"):
-            system.process(first, image=image, depth=(depth * 1000).astype(np.uint16))
-        with pytest.raises(ValueError, match="made for image, depth, not for imu"):
-            system.process(first, image=image, imu=next(room.given("imu"))[1]["imu"])
-        with pytest.raises(TypeError, match="depth takes DepthImage, not Image"):
-            system.process(first, depth=given["image"])
-        with pytest.raises(ValueError, match="image has stamp"):
-            system.process(first - 1, image=given["image"])
+        for kind, text, stamp, measured in wrong:
+            with pytest.raises(kind, match=text):
+                system.process(stamp, **measured)
         assert system.process(first, image=image, depth=depth).pose is not None
         with pytest.raises(ValueError, match="stamps must increase"):
             system.process(first, image=image, depth=depth)

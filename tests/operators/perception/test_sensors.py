@@ -12,21 +12,16 @@ GRAPH = "graph: handed\noperators: {sensors: {use: 'operators.perception.sensors
 
 
 def test_it_stands_for_a_device_whose_calibrations_are_static() -> None:
-    node = load_text(GRAPH).nodes["sensors"]
-    streams = load_text(GRAPH).streams
-
+    graph = load_text(GRAPH)
+    node = graph.nodes["sensors"]
     assert node.source
     assert HandedSensors.real_time
-    static = {port for port, name in node.outputs.items() if streams[name].static}
-    assert static == {"image_info", "depth_info", "extrinsics"}
-    assert {port: streams[name].types for port, name in node.outputs.items() if port not in static} == {
-        "image": ("Image",),
-        "depth": ("DepthImage",),
-        "points": ("PointCloud",),
-        "imu": ("Imu",),
-        "wheels": ("Odometry",),
-        "command": ("Twist",),
-    }
+    streams = {port: graph.streams[name] for port, name in node.outputs.items()}
+    assert {port for port, stream in streams.items() if stream.static} == {"image_info", "depth_info", "extrinsics"}
+    assert {port: stream.types[0] for port, stream in streams.items() if not stream.static} == {
+        "image": "Image", "depth": "DepthImage", "points": "PointCloud", "imu": "Imu", "wheels": "Odometry",
+        "command": "Twist",
+    }  # fmt: skip
 
 
 def test_it_refuses_to_be_run_as_a_device() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from repeated import assert_repeats
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import FeatureVector
@@ -41,12 +42,8 @@ def test_vectors_of_another_model_begin_anew_and_old_ones_are_forgotten() -> Non
     assert answers[-1] == {2: [0, 1]}, "2 was described before 1 and 3, so it is begun anew"
 
 
-def test_the_state_goes_on_where_it_was() -> None:
-    one, other = FeatureMemory(), FeatureMemory()
-    one.process(vectors(1, {4: (1, 0)}))
-    other.restore(one.snapshot())
-    again = vectors(2, {4: (0, 1)})
-    assert one.process(again).digest() == other.process(again).digest()
+def test_means_repeat_and_a_restored_memory_goes_on() -> None:
+    assert_repeats(FeatureMemory, [(vectors(1, {4: (1, 0)}),), (vectors(2, {4: (0, 1)}),)], 1)
 
 
 def test_vectors_without_ids_are_refused() -> None:

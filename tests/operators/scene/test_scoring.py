@@ -6,37 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_graphs import scene_graph
 
 from dataflow.messages import Detections2D, SceneGraph
 from operators.labels import LabelSpace, labels_file
 from operators.scene.relations import FLOOR
 from operators.scene.scoring import PlainlySeen, RelationScore, score_nodes
 
-CLASSES = ("floor", "mug", "table", "ball")
-
 
 def graph(nodes: dict[int, tuple[str, float]], relations: list[tuple[int, str, int]]) -> SceneGraph:
     """Boxes of half a metre, by id: class and x."""
-    rows = [FLOOR, *nodes]
-    return SceneGraph(
-        stamp=0,
-        frame="world",
-        class_names=CLASSES,
-        predicates=tuple(p for _, p, _ in relations),
-        ids=np.array(rows),
-        class_ids=np.array([0, *(CLASSES.index(name) for name, _ in nodes.values())]),
-        scores=np.ones(len(nodes) + 1, np.float32),
-        positions=np.array([[0, 0, -0.1], *([x, 0, 1.0] for _, x in nodes.values())]),
-        sizes=np.array([[20, 20, 0.1], *([0.5, 0.5, 0.5] for _ in nodes)]),
-        subjects=np.array([rows.index(s) for s, _, _ in relations]),
-        objects=np.array([rows.index(o) for _, _, o in relations]),
-        relation_scores=np.ones(len(relations), np.float32),
-    )
+    things = [(id, name, (x, 0, 1.0), (0.5, 0.5, 0.5)) for id, (name, x) in nodes.items()]
+    scores = np.ones(len(nodes) + 1, np.float32)
+    return scene_graph([(FLOOR, "floor", (0, 0, -0.1), (20, 20, 0.1)), *things], relations, scores=scores)
 
 
 TRUTH = graph(
-    {11: ("mug", 1.0), 12: ("table", 2.0), 13: ("ball", 3.0)},
-    [(11, "near", 12), (12, "near", 13), (12, "on", FLOOR)],
+    {11: ("mug", 1.0), 12: ("table", 2.0), 13: ("ball", 3.0)}, [(11, "near", 12), (12, "near", 13), (12, "on", FLOOR)]
 )
 
 
@@ -95,18 +81,11 @@ def test_what_is_mapped_scores_by_itself() -> None:
 
 def in_image(second: int, ids: list[int]) -> Detections2D:
     return Detections2D(
-        stamp=second * 1_000_000_000,
-        frame="camera",
-        width=100,
-        height=100,
-        class_names=("thing",),
-        boxes=np.tile(np.array([0, 0, 50, 50], np.float32), (len(ids), 1)),
-        scores=np.ones(len(ids), np.float32),
-        class_ids=np.zeros(len(ids), np.int32),
-        ids=np.array(ids, np.int64),
-        visible=np.ones(len(ids), np.float32),
+        stamp=second * 1_000_000_000, frame="camera", width=100, height=100, class_names=("thing",),
+        boxes=np.tile(np.array([0, 0, 50, 50], np.float32), (len(ids), 1)), scores=np.ones(len(ids), np.float32),
+        class_ids=np.zeros(len(ids), np.int32), ids=np.array(ids, np.int64), visible=np.ones(len(ids), np.float32),
         pixel_counts=np.full(len(ids), 2500, np.int64),
-    )
+    )  # fmt: skip
 
 
 def test_a_map_must_have_what_was_plainly_seen_by_then_and_movers_while_they_are_in_view() -> None:

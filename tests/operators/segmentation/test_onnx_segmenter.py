@@ -64,7 +64,7 @@ def image(width: int = 64, height: int = 48, seed: int = 0) -> Image:
 
 
 def segmented(seen: Image | None = None, **params: Any) -> SegmentationMap:
-    return play(OnnxSegmenter(**params), {"image": [seen or image()]})["segmentation"][0]  # type: ignore[return-value]
+    return play(OnnxSegmenter(**params), {"image": [seen or image()]})["segmentation"][0]
 
 
 def direct(model: str, tensor: np.ndarray) -> np.ndarray:

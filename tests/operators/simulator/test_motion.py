@@ -176,7 +176,7 @@ def test_persons_pass_through_no_furniture(name: str, seed: int, people: int) ->
     for person in (thing for thing in here.objects() if thing.label == "person"):
         ends = triangles_of(person)
         edges = np.unique(np.sort(np.concatenate([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]), axis=1), axis=0)
-        for t in np.arange(0, person.mover.timeline.period, 0.4 if people == 2 else 0.7):  # type: ignore[attr-defined]
+        for t in np.arange(0, person.mover.timeline.period, 0.4 if people == 2 else 0.7):
             a, b = person.vertices(t)[edges].transpose(1, 0, 2)
             hits = scene.cast_rays(o3d.core.Tensor(np.concatenate([a, b - a], axis=1).astype(np.float32)), nthreads=1)
             met = hits["geometry_ids"].numpy()[hits["t_hit"].numpy() < 1]

@@ -120,7 +120,7 @@ def test_a_sensor_measures_the_same_alone_and_beside_all_others(
 def test_a_sensor_that_is_off_has_no_messages_and_no_frame() -> None:
     streams = camera_only(color_camera=SMALL)
     assert set(streams) == {"image", "image_info", "extrinsics"}
-    assert set(streams["extrinsics"][0].child_frames) == {"camera_depth_optical", "camera_color_optical"}  # type: ignore[attr-defined]
+    assert set(streams["extrinsics"][0].child_frames) == {"camera_depth_optical", "camera_color_optical"}
 
 
 @pytest.mark.long
@@ -176,8 +176,8 @@ def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
         run(**{**OFF, "movers": False, "duration": "3s", "inertial": {**quiet, "delay": delay}})["imu"]
         for delay in (0, "50ms")
     )
-    turning = np.array([m.angular_velocity[2] for m in sharp])  # type: ignore[attr-defined]
-    delayed = np.array([m.angular_velocity[2] for m in late])  # type: ignore[attr-defined]
+    turning = np.array([m.angular_velocity[2] for m in sharp])
+    delayed = np.array([m.angular_velocity[2] for m in late])
     np.testing.assert_allclose(delayed[5:], turning[:-5], atol=1e-9)
     assert np.abs(delayed - turning).max() > 1e-3
 
@@ -188,14 +188,14 @@ def test_black_depth_frames_have_no_return_and_black_pairs_no_light() -> None:
         duration="400ms", movers=False, color_camera={"rate": 0, **SMALL}, truth=QUIET,
         depth_camera={"rate": 5, "black": 1.0}, stereo={"rate": 5, **SMALL, "black": 1.0},
     )  # fmt: skip
-    assert not any(m.data.any() for m in dark["depth"])  # type: ignore[attr-defined]
-    assert all(m.data.mean() < 5 for port in ("left", "right") for m in dark[port])  # type: ignore[attr-defined]
+    assert not any(m.data.any() for m in dark["depth"])
+    assert all(m.data.mean() < 5 for port in ("left", "right") for m in dark[port])
 
 
 @pytest.mark.long
 def test_seeds_make_different_worlds() -> None:
     first, second = (camera_only(seed=seed, duration="100ms", color_camera=SMALL)["image"][0] for seed in (0, 1))
-    assert np.abs(first.data.astype(int) - second.data).mean() > 10  # type: ignore[attr-defined]
+    assert np.abs(first.data.astype(int) - second.data).mean() > 10
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_boxes_in_space_enclose_the_boxes_in_the_image(robot: SimulatedRobot, st
             p = transform_points(T_camera_world, corners)
             if p[:, 2].min() < 0.1:
                 continue
-            uv = p[:, :2] / p[:, 2:] * [info.fx, info.fy] + [info.cx, info.cy]  # type: ignore[attr-defined]
+            uv = p[:, :2] / p[:, 2:] * [info.fx, info.fy] + [info.cx, info.cy]
             low, high = uv.min(axis=0), uv.max(axis=0)
             assert (flat.boxes[k, :2] >= low - 1).all()
             assert (flat.boxes[k, 2:] <= high + 2).all()
@@ -272,7 +272,7 @@ def test_a_goal_that_is_given_is_reached(robot: SimulatedRobot) -> None:
     reached = set()
     for person in (t for t in world.objects() if isinstance(t.mover, Person)):
         goals = {}
-        for t in np.arange(0, person.mover.timeline.period, 0.2):  # type: ignore[attr-defined]
+        for t in np.arange(0, person.mover.timeline.period, 0.2):
             (doing,) = (d for d in world.doings(t) if d.thing == person.id)
             goals.setdefault(doing.goal, set()).update(
                 (r.predicate, r.object) for r in world.relations(t) if r.subject == person.id

@@ -39,9 +39,9 @@ def test_a_broad_trial_in_tesla_with_the_truth_of_its_movement(tmp_path: Path) -
     assert play(BroadImu(path=file)).digests() == played.digests()
     assert [m.stamp for m in played["imu"]] == [0, 5_000_000, 10_000_000, 15_000_000]
     assert [m.stamp for m in played["magnetic_field"]] == [0, 10_000_000, 15_000_000]
-    np.testing.assert_allclose(played["magnetic_field"][0].field, [20e-6, 0, -40e-6])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(played["magnetic_field"][0].field, [20e-6, 0, -40e-6])
     assert [m.stamp for m in played["ground_truth"]] == [5_000_000, 15_000_000]
-    assert played["ground_truth"][0].orientation.tolist() == [1, 0, 0, 0]  # type: ignore[attr-defined]
+    assert played["ground_truth"][0].orientation.tolist() == [1, 0, 0, 0]
 
 
 def test_everything_known_is_given_if_asked(tmp_path: Path) -> None:

@@ -29,14 +29,14 @@ def test_euroc_stamps_are_exact_and_both_streams_keep_their_own(folder: Path) ->
     assert play(EurocImu(path=str(folder))).digests() == played.digests()
     assert [m.stamp for m in played["imu"]] == [100, 5000100]
     assert [m.stamp for m in played["ground_truth"]] == [100, 2500000]
-    assert played["imu"][1].linear_acceleration.tolist() == [4, 5, 6]  # type: ignore[attr-defined]
-    assert played["ground_truth"][1].orientation.tolist() == [0, 0, 1, 0]  # type: ignore[attr-defined]
+    assert played["imu"][1].linear_acceleration.tolist() == [4, 5, 6]
+    assert played["ground_truth"][1].orientation.tolist() == [0, 0, 1, 0]
 
 
 def test_euroc_densities_give_the_covariance_of_a_sample(folder: Path) -> None:
     sample = play(EurocImu(path=str(folder)))["imu"][0]
-    np.testing.assert_allclose(sample.angular_velocity_covariance, np.eye(3) * 1e-8 * 200)  # type: ignore[attr-defined]
-    np.testing.assert_allclose(sample.linear_acceleration_covariance, np.eye(3) * 4e-6 * 200)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(sample.angular_velocity_covariance, np.eye(3) * 1e-8 * 200)
+    np.testing.assert_allclose(sample.linear_acceleration_covariance, np.eye(3) * 4e-6 * 200)
 
 
 def test_a_euroc_folder_without_truth_or_densities_gives_the_samples_alone(folder: Path) -> None:
@@ -45,8 +45,8 @@ def test_a_euroc_folder_without_truth_or_densities_gives_the_samples_alone(folde
     (folder / "imu.csv").write_text("100,0.1,0.2,0.3,1,2,3\n")
     played = play(EurocImu(path=str(folder)))
     assert played["ground_truth"] == []
-    assert [(m.stamp, m.frame) for m in played["imu"]] == [(100, "imu")]  # type: ignore[attr-defined]
-    assert played["imu"][0].angular_velocity_covariance is None  # type: ignore[attr-defined]
+    assert [(m.stamp, m.frame) for m in played["imu"]] == [(100, "imu")]
+    assert played["imu"][0].angular_velocity_covariance is None
 
 
 @pytest.mark.parametrize(

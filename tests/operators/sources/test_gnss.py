@@ -35,7 +35,7 @@ def rmc(time: str, date: str = "230394") -> bytes:
 
 
 def utc(*when: int) -> int:
-    return int(datetime(*when, tzinfo=UTC).timestamp()) * 10**9  # type: ignore[arg-type, misc]
+    return int(datetime(*when, tzinfo=UTC).timestamp()) * 10**9
 
 
 def read(data: bytes, clock: Clock = "receiver", step: int = 10**9) -> tuple[list[NavSatFix], Receiver]:

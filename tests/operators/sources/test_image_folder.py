@@ -103,14 +103,14 @@ def growing(folder: Path, *acts: Act, stamps: str = "number") -> GrowingImageFol
     """A source during whose pauses these happen, one after the other; then the run ends."""
 
     class Scripted(GrowingImageFolder):
-        def _follow(self):  # type: ignore[no-untyped-def]
+        def _follow(self):
             left = list(acts)
 
             def wait(seconds: float) -> bool:
                 left.pop(0)(folder) if left else self.stop_reading()
                 return True
 
-            self._stopped.wait = wait  # type: ignore[assignment, method-assign]
+            self._stopped.wait = wait
             return super()._follow()
 
     return Scripted(path=str(folder), rate=1e9, stamps=stamps)

@@ -36,7 +36,7 @@ def poses() -> list[Array]:
 
 @pytest.fixture(params=[("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r")], ids=lambda p: p[0])
 def pair(request: pytest.FixtureRequest) -> tuple[str, str]:
-    return request.param  # type: ignore[no-any-return]
+    return request.param
 
 
 def written(folder: Path, pair: tuple[str, str] = ("image_0", "image_1")) -> Path:
@@ -63,7 +63,7 @@ def test_images_calibration_and_poses_are_those_of_the_files(tmp_path: Path, pai
             assert isinstance(made, Image)
             assert made.stamp == 7 + i * 100_000_000
             np.testing.assert_array_equal(made.data, image(i, port == "right"))
-        np.testing.assert_allclose(played["ground_truth"][i].matrix(), poses()[i], atol=1e-9)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(played["ground_truth"][i].matrix(), poses()[i], atol=1e-9)
     info = source.static_outputs()["right_info"]
     assert isinstance(info, CameraInfo)
     assert info.P is not None
@@ -74,7 +74,7 @@ def test_images_calibration_and_poses_are_those_of_the_files(tmp_path: Path, pai
 def test_a_part_keeps_its_stamps_and_poses(tmp_path: Path) -> None:
     played = play(KittiOdometry(path=str(written(tmp_path)), start=1, stop=2, rate=5.0))
     assert [m.stamp for m in played["left"]] == [200_000_000]
-    np.testing.assert_allclose(played["ground_truth"][0].matrix(), poses()[1], atol=1e-9)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(played["ground_truth"][0].matrix(), poses()[1], atol=1e-9)
 
 
 def test_colour_images_are_rgb(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_colour_images_are_rgb(tmp_path: Path) -> None:
     blue[..., 0] = 200  # OpenCV writes BGR
     cv2.imwrite(str(folder / "image_0" / "000000.png"), blue)
     left = play(KittiOdometry(path=str(folder), stop=1, color=True))["left"][0]
-    assert left.data[0, 0].tolist() == [0, 0, 200]  # type: ignore[attr-defined]
+    assert left.data[0, 0].tolist() == [0, 0, 200]
 
 
 def test_a_folder_without_truth_gives_the_images_alone(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from dataflow.interop.export.kitti_oxts import packet_of
 from dataflow.interop.export.kitti_raw import export_kitti_raw
-from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
+from dataflow.interop.export.source import ExportSource
 from dataflow.messages import Imu, Message, NavSatFix, Odometry, PointCloud, Transforms
 from dataflow.messages.geometry import quaternion_to_matrix
 from dataflow.operator import SourceError
@@ -110,7 +110,7 @@ def test_a_part_of_a_drive_has_the_packets_of_its_frames_from_the_origin_of_the_
     part = play(KittiRaw(path=str(folder), start=1, stop=4, stride=2))
     assert offsets(part, "points") == [100, 300]
     assert offsets(part, "imu") == [120, 220]
-    assert part["odometry"][0].position[1] == pytest.approx(11.12, abs=0.01)  # type: ignore[attr-defined]
+    assert part["odometry"][0].position[1] == pytest.approx(11.12, abs=0.01)
 
 
 def test_a_drive_without_times_has_its_packets_with_their_frames(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def recorded(path: Path, packets: list[Packet], *without: str) -> Path:
 
 def exported(path: Path, out: Path) -> tuple[Path, Exported]:
     done = Exported()
-    with Material(path) as material:
+    with ExportSource(path) as material:
         export_kitti_raw(material, out, done)
     return out / "2011_09_26/2011_09_26_drive_0001_sync", done
 
@@ -213,7 +213,7 @@ def test_a_recording_becomes_a_drive_whose_packets_read_as_its_messages(tmp_path
         cv2.imwrite(str(folder / f"image_02/{k:010d}.png"), np.zeros((4, 6, 3), np.uint8))
     (folder / "calib.txt").write_text(CALIBRATION)
     played = play(KittiRaw(path=str(folder)))
-    with Material(path) as material:
+    with ExportSource(path) as material:
         for port in ("imu", "fix", "odometry"):
             before = [recorded.message for recorded in material.messages([port])]
             assert [m.stamp for m in played[port]] == [m.stamp for m in before]
@@ -221,7 +221,7 @@ def test_a_recording_becomes_a_drive_whose_packets_read_as_its_messages(tmp_path
                 for field in type(one).FIELDS:
                     a, b = getattr(one, field.name), getattr(other, field.name)
                     assert a == b if isinstance(a, str | int | None) else np.allclose(a, b, atol=1e-9), field.name
-    assert played["imu_extrinsics"][0].translations.round(9).tolist() == [[0.8, -0.3, 0.8]]  # type: ignore[attr-defined]
+    assert played["imu_extrinsics"][0].translations.round(9).tolist() == [[0.8, -0.3, 0.8]]
     assert done.left_out == {}
 
 

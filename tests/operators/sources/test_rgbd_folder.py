@@ -66,7 +66,7 @@ def test_7scenes_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(image.data, COLOR)
     assert depth.data[0, :5].tolist() == [0, 0, 6, 0, 1.5]  # no return, invalid, the farthest, beyond, ordinary
     unlimited = read(tmp_path, max_depth=100)[1][1]["depth"]
-    assert unlimited.data[0, :4].tolist() == [0, 0, 6, np.float32(6.001)]  # type: ignore[attr-defined]
+    assert unlimited.data[0, :4].tolist() == [0, 0, 6, np.float32(6.001)]
     statics = source.static_outputs()
     depth_info, image_info, extrinsics = (statics[p] for p in ("depth_info", "image_info", "extrinsics"))
     assert isinstance(depth_info, CameraInfo)
@@ -141,8 +141,8 @@ def test_given_calibration_and_names_win(tmp_path: Path) -> None:
     assert isinstance(image_info, CameraInfo)
     assert extrinsics.matrix("rgb")[0, 3] == 0.025
     assert image_info.K.tolist() == [[500, 0, 4.5], [0, 501, 3.5], [0, 0, 1]]
-    assert [m["image"].frame for m in frames] == ["rgb"] * 3  # type: ignore[attr-defined]
-    assert not frames[0]["depth"].data.any()  # type: ignore[attr-defined]
+    assert [m["image"].frame for m in frames] == ["rgb"] * 3
+    assert not frames[0]["depth"].data.any()
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_given_calibration_and_names_win(tmp_path: Path) -> None:
         (lambda f: np.savetxt(f / "camera-intrinsics.txt", -np.eye(3)), r"camera-intrinsics\.txt: not an intrinsic"),
     ],
 )
-def test_a_spoiled_file_is_named_with_its_frame(tmp_path: Path, spoil, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_spoiled_file_is_named_with_its_frame(tmp_path: Path, spoil, message: str) -> None:
     spoil(write_7scenes(tmp_path))
     with pytest.raises(SourceError, match=message):
         read(tmp_path, strict=True)
@@ -283,7 +283,7 @@ def ramp(near: float, far: float, scale: float) -> np.ndarray:
 
 def depth_of(folder: Path, **params: object) -> float:
     """The depth (m) of the last pixel of the last frame."""
-    return float(read(folder, max_depth=50, **params)[1][-1]["depth"].data[-1, -1])  # type: ignore[attr-defined]
+    return float(read(folder, max_depth=50, **params)[1][-1]["depth"].data[-1, -1])
 
 
 def fill(folder: Path, raw: np.ndarray) -> Path:
@@ -298,7 +298,7 @@ def fill(folder: Path, raw: np.ndarray) -> Path:
     ("write", "unit", "guessed"),
     [(write_tum, 1000, True), (write_tum, 5000, False), (write_7scenes, 5000, True), (write_7scenes, 1000, False)],
 )
-def test_the_values_show_the_unit_of_depth(tmp_path: Path, write, unit, guessed, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_the_values_show_the_unit_of_depth(tmp_path: Path, write, unit, guessed, caplog) -> None:
     caplog.set_level("INFO")
     folder = fill(write(tmp_path), ramp(0.8, 4.0, unit))
 
@@ -315,7 +315,7 @@ def test_the_values_show_the_unit_of_depth(tmp_path: Path, write, unit, guessed,
         (12.0, 13.0, "WARNING"),  # far in either unit
     ],
 )
-def test_doubt_about_the_unit_leaves_the_layouts_and_is_said_once(  # type: ignore[no-untyped-def]
+def test_doubt_about_the_unit_leaves_the_layouts_and_is_said_once(
     tmp_path: Path, near: float, far: float, level: str, caplog
 ) -> None:
     caplog.set_level("INFO")
@@ -327,7 +327,7 @@ def test_doubt_about_the_unit_leaves_the_layouts_and_is_said_once(  # type: igno
     assert "5000 units a metre" in caplog.records[0].message
 
 
-def test_a_given_unit_is_taken_without_a_word(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_a_given_unit_is_taken_without_a_word(tmp_path: Path, caplog) -> None:
     caplog.set_level("INFO")
     folder = fill(write_tum(tmp_path), ramp(0.8, 4.0, 1000))
 
@@ -345,8 +345,8 @@ def test_a_damaged_image_beyond_what_is_read_does_not_count(tmp_path: Path) -> N
 def test_registered_depth_is_of_the_colour_camera(tmp_path: Path) -> None:
     statics = read(write_7scenes(tmp_path), registered=True)[0].static_outputs()
 
-    assert statics["image_info"].K.tolist() == statics["depth_info"].K.tolist()  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(statics["extrinsics"].matrix("camera_color_optical"), np.eye(4))  # type: ignore[attr-defined]
+    assert statics["image_info"].K.tolist() == statics["depth_info"].K.tolist()
+    np.testing.assert_array_equal(statics["extrinsics"].matrix("camera_color_optical"), np.eye(4))
 
 
 def test_registration_that_contradicts_is_refused(tmp_path: Path) -> None:
@@ -354,7 +354,7 @@ def test_registration_that_contradicts_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="registered: false needs T_depth_image"):
         read(write_tum(tmp_path / "tum"), registered=False)
     source, _ = read(tmp_path / "tum", registered=False, T_depth_image=place)
-    assert source.static_outputs()["extrinsics"].matrix("camera_color_optical")[0, 3] == 0.05  # type: ignore[attr-defined]
+    assert source.static_outputs()["extrinsics"].matrix("camera_color_optical")[0, 3] == 0.05
     with pytest.raises(SourceError, match="exclude each other"):
         read(tmp_path / "tum", registered=True, T_depth_image=place)
     fill(tmp_path / "tum", DEPTH[:4])
@@ -365,7 +365,7 @@ def test_registration_that_contradicts_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("folder", ["rgbd_7scenes", "scenes/fr1_rpy", "scenes/cup_table"])
-def test_real_folders_have_their_layouts_unit(data_dir: Path, folder: str, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_real_folders_have_their_layouts_unit(data_dir: Path, folder: str, caplog) -> None:
     source = RgbdFolder(path=str(data_dir / folder))
     source.setup()
 
@@ -373,7 +373,7 @@ def test_real_folders_have_their_layouts_unit(data_dir: Path, folder: str, caplo
 
 
 @pytest.mark.data
-def test_real_millimetres_in_the_layout_of_tum_are_read_as_such(data_dir: Path, tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_real_millimetres_in_the_layout_of_tum_are_read_as_such(data_dir: Path, tmp_path: Path, caplog) -> None:
     lists: dict[str, list[str]] = {"rgb": [], "depth": []}
     for k in range(0, 250, 25):
         for name, file in (("rgb", f"frame-{k:06d}.color.jpg"), ("depth", f"frame-{k:06d}.depth.png")):
@@ -383,7 +383,7 @@ def test_real_millimetres_in_the_layout_of_tum_are_read_as_such(data_dir: Path, 
 
     depth = read(tmp_path)[1][0]["depth"]
 
-    assert 1.0 < np.median(depth.data[depth.data > 0]) < 3.0  # type: ignore[attr-defined]
+    assert 1.0 < np.median(depth.data[depth.data > 0]) < 3.0
     assert "depth_scale" in caplog.text
 
 

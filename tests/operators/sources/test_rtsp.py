@@ -28,7 +28,7 @@ def test_images_of_a_network_camera_come_in_order_and_again_after_the_connection
         assert list(steps) == []
         source.close()
 
-    assert (info.width, info.height) == (64, 48)  # type: ignore[attr-defined]
+    assert (info.width, info.height) == (64, 48)
     shown = [round((grey(image) - shade(0)) / 10) for image in images]
     before = len(shown) - 1 - shown[::-1].index(1)  # the last image 1 is the first of the second connection
     assert shown[:before] == [number % 20 for number in range(1, before + 1)]

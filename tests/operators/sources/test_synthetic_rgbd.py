@@ -48,7 +48,7 @@ def surface_distance(points: np.ndarray) -> np.ndarray:
 def test_every_depth_pixel_lies_on_a_surface() -> None:
     info, frames = play(depth_noise=0, rate=1)
     for messages in frames:
-        points = world_points(info, messages["depth"], messages["ground_truth"])  # type: ignore[arg-type]
+        points = world_points(info, messages["depth"], messages["ground_truth"])
         assert surface_distance(points.reshape(-1, 3)).max() < 1e-5
 
 
@@ -58,7 +58,7 @@ def test_colour_follows_the_surface_from_frame_to_frame() -> None:
     first, second = frames[0]["image"], frames[1]["image"]
     assert isinstance(first, Image)
     assert isinstance(second, Image)
-    points = world_points(info, frames[1]["depth"], frames[1]["ground_truth"])  # type: ignore[arg-type]
+    points = world_points(info, frames[1]["depth"], frames[1]["ground_truth"])
 
     def difference(T_world_camera: np.ndarray) -> float:
         T = np.linalg.inv(T_world_camera)
@@ -68,14 +68,14 @@ def test_colour_follows_the_surface_from_frame_to_frame() -> None:
         inside = (u > 0) & (v > 0) & (u < first.data.shape[1] - 1) & (v < first.data.shape[0] - 1)
         return float(np.median(np.abs(warped.astype(float) - second.data)[inside]))
 
-    assert difference(frames[0]["ground_truth"].matrix()) < 3  # type: ignore[attr-defined]
-    assert difference(frames[1]["ground_truth"].matrix()) > 6  # type: ignore[attr-defined]
+    assert difference(frames[0]["ground_truth"].matrix()) < 3
+    assert difference(frames[1]["ground_truth"].matrix()) > 6
 
 
 def test_there_are_corners_to_track() -> None:
     _, frames = play(width=320, height=240, rate=1, frames=4)
     for messages in frames:
-        gray = cv2.cvtColor(messages["image"].data, cv2.COLOR_RGB2GRAY)  # type: ignore[attr-defined]
+        gray = cv2.cvtColor(messages["image"].data, cv2.COLOR_RGB2GRAY)
         assert len(cv2.goodFeaturesToTrack(gray, 300, 0.01, 8)) > 150
 
 
@@ -123,12 +123,12 @@ def test_the_path_is_smooth_and_closes() -> None:
 def test_the_noise_is_as_strong_as_asked() -> None:
     _, clean = play(frames=1, image_noise=0, depth_noise=0)
     _, noisy = play(frames=1, image_noise=3, depth_noise=0.002)
-    z = clean[0]["depth"].data  # type: ignore[attr-defined]
-    error = (noisy[0]["depth"].data - z) / z**2  # type: ignore[attr-defined]
+    z = clean[0]["depth"].data
+    error = (noisy[0]["depth"].data - z) / z**2
     assert error.std() == pytest.approx(0.002, rel=0.05)
-    pixels = clean[0]["image"].data  # type: ignore[attr-defined]
+    pixels = clean[0]["image"].data
     middling = (pixels > 20) & (pixels < 235)
-    error = noisy[0]["image"].data.astype(float) - pixels  # type: ignore[attr-defined]
+    error = noisy[0]["image"].data.astype(float) - pixels
     assert error[middling].std() == pytest.approx(3, rel=0.05)
 
 

@@ -33,7 +33,7 @@ def ymr(more: str = "") -> bytes:
 
 def read(*chunks: bytes, **params: int | str) -> tuple[list, VectorNavImu]:
     source = VectorNavImu(input="udp://127.0.0.1:1", **params)
-    source._open = lambda: os.open(os.devnull, os.O_RDONLY)  # type: ignore[method-assign]
+    source._open = lambda: os.open(os.devnull, os.O_RDONLY)
     source.setup()
     found = [step for k, data in enumerate(chunks) for step in source._take(data, 1000 * (k + 1))]
     source.close()
@@ -112,8 +112,8 @@ def test_an_imu_that_is_unplugged_goes_on_when_it_is_back(tmp_path: Path, caplog
     assert list(steps) == []
     source.close()
     os.close(cable.end)
-    assert first.angular_velocity[0] == 0.1  # type: ignore[union-attr]
-    assert second.angular_velocity[0] == 0.5  # type: ignore[union-attr]
+    assert first.angular_velocity[0] == 0.1
+    assert second.angular_velocity[0] == 0.5
     assert source.summary() == {
         "clock": "machine", "messages": "IMU 2", "bad_messages": 1, "unplugged": 1,
     }  # fmt: skip
@@ -125,7 +125,7 @@ def test_datagrams_are_read() -> None:
     source = VectorNavImu(input=f"udp://127.0.0.1:{port}")
     source.setup()
     send_datagrams(port, b"", REAL)
-    assert next(source.stream())["imu"].temperature == 20.7  # type: ignore[union-attr]
+    assert next(source.stream())["imu"].temperature == 20.7
     source.close()
 
 

@@ -145,7 +145,7 @@ def test_datagrams_of_anybody_are_counted_and_end_nothing(tmp_path: Path) -> Non
     clouds = play(source)["cloud"]
 
     alone = play(VelodyneFile(input=str(capture(tmp_path / "c.pcap", turns))))["cloud"]
-    assert [len(c.points) for c in clouds] == [len(c.points) for c in alone]  # type: ignore[attr-defined]
+    assert [len(c.points) for c in clouds] == [len(c.points) for c in alone]
     assert source.summary()["packets"] == 160
     assert source.summary()["other_datagrams"] == 2 * len(junk) - 2  # those without bytes are silence
     assert play(VelodyneFile(input=str(capture(tmp_path / "b.pcap", junk))))["cloud"] == []
@@ -161,7 +161,7 @@ def test_packets_of_another_sensors_model_are_left_out(tmp_path: Path, caplog: p
 
     clouds = play(mixed)["cloud"]
 
-    assert [len(c.points) for c in clouds] == [len(c.points) for c in alone]  # type: ignore[attr-defined]
+    assert [len(c.points) for c in clouds] == [len(c.points) for c in alone]
     assert (mixed.summary()["packets"], mixed.summary()["other_datagrams"]) == (160, 2)
     assert caplog.text.count("packets of model 40 are left out: those before are of model 34") == 1
     assert len(play(before)["cloud"]) == len(alone)
@@ -188,7 +188,7 @@ def test_a_lidar_over_udp_is_read_and_its_silence_drops_the_turn(caplog: pytest.
         clouds = [step["cloud"] for step in source.stream()]
 
     assert [cloud.stamp // 10**9 - START for cloud in clouds] == [0, 60, 60, 60]
-    assert all(np.ptp(cloud.time_offsets) < 0.11 for cloud in clouds)  # type: ignore[attr-defined]
+    assert all(np.ptp(cloud.time_offsets) < 0.11 for cloud in clouds)
     assert source.summary()["unplugged"] == 1
     assert [r.getMessage() for r in caplog.records] == [
         "no packets from the LiDAR at udp://127.0.0.1:2368: it is waited for"

@@ -35,14 +35,14 @@ def steps_of(file: Path) -> list[dict[str, object]]:
 
 def test_poses_are_dead_reckoned_and_stamped_by_the_period(file: Path) -> None:
     odometry = [step["odometry"] for step in steps_of(file)]
-    assert [o.stamp for o in odometry] == [0, 500_000_000, 1_000_000_000]  # type: ignore[attr-defined]
-    positions = [o.position[:2] for o in odometry]  # type: ignore[attr-defined]
+    assert [o.stamp for o in odometry] == [0, 500_000_000, 1_000_000_000]
+    positions = [o.position[:2] for o in odometry]
     np.testing.assert_allclose(positions, [[0, 0], [1, 0], [0.5, 2]], atol=1e-12)
-    np.testing.assert_allclose(yaw_of(odometry[2].orientation), np.pi / 2)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(yaw_of(odometry[2].orientation), np.pi / 2)
 
 
 def test_a_twist_covariance_is_that_of_the_step(file: Path) -> None:
-    spread = steps_of(file)[2]["odometry"].twist_covariance[np.ix_([0, 1, 5], [0, 1, 5])]  # type: ignore[attr-defined]
+    spread = steps_of(file)[2]["odometry"].twist_covariance[np.ix_([0, 1, 5], [0, 1, 5])]
     expected = [[0.01, 0.001, 0.002], [0.001, 0.02, 0.003], [0.002, 0.003, 0.03]]
     np.testing.assert_allclose(spread * 0.5**2, expected)
 
@@ -51,10 +51,10 @@ def test_sightings_belong_to_their_pose(file: Path) -> None:
     steps = steps_of(file)
     assert "sightings" not in steps[0]
     seen = steps[1]["sightings"]
-    assert seen.ids.tolist() == [7]  # type: ignore[attr-defined]
-    np.testing.assert_allclose(seen.positions, [[2, -1]])  # type: ignore[attr-defined]
-    np.testing.assert_allclose(seen.covariances, [[[0.4, 0.1], [0.1, 0.5]]])  # type: ignore[attr-defined]
-    assert steps[2]["sightings"].ids.tolist() == [7, 8]  # type: ignore[attr-defined]
+    assert seen.ids.tolist() == [7]
+    np.testing.assert_allclose(seen.positions, [[2, -1]])
+    np.testing.assert_allclose(seen.covariances, [[[0.4, 0.1], [0.1, 0.5]]])
+    assert steps[2]["sightings"].ids.tolist() == [7, 8]
 
 
 @pytest.mark.parametrize(

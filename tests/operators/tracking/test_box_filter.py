@@ -44,21 +44,15 @@ def test_predicting_together_equals_predicting_alone() -> None:
 
 def test_tracks_by_filterpy_equal_those_by_numpy() -> None:
     rng = np.random.default_rng(0)
+    places = [np.array([[20.0 + 9 * k, 100, 80 + 9 * k, 260], [500 - 7 * k, 90, 560 - 7 * k, 250]]) for k in range(30)]
     images = [
         Detections2D(
-            stamp=(k + 1) * 100_000_000,
-            frame="camera",
-            width=640,
-            height=480,
-            class_names=("person",),
-            boxes=np.array([[20.0 + 9 * k, 100, 80 + 9 * k, 260], [500 - 7 * k, 90, 560 - 7 * k, 250]])
-            + rng.normal(0, 1, (2, 4)),
-            scores=np.array([0.9, 0.7], np.float32),
-            class_ids=np.zeros(2, np.int32),
+            stamp=(k + 1) * 100_000_000, frame="camera", width=640, height=480, class_names=("person",),
+            boxes=place + rng.normal(0, 1, (2, 4)), scores=[0.9, 0.7], class_ids=np.zeros(2, np.int32),
         )
-        for k in range(30)
+        for k, place in enumerate(places)
         if k % 11
-    ]
+    ]  # fmt: skip
     ours, theirs = (
         play(MultiObjectTracker(filter=each), {"detections": images})["tracks"] for each in ("numpy", "filterpy")
     )

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from operators.recognition.activity.episodes import Episode
 from operators.recognition.activity.features import COUNT
-from operators.recognition.activity.model import ActivityModel
-from operators.recognition.activity.score import macro_f1
+from operators.recognition.activity.recognizer import ActivityModel
+from operators.recognition.activity.samples import macro_f1
 from operators.recognition.activity.sensed_people import SensedTrack, write_tracks
 from operators.recognition.posture.data import BODY, POSTURES, Postures
-from operators.recognition.posture.model import PostureModel
+from operators.recognition.posture.recognizer import PostureModel
 from operators.recognition.posture.silhouette import MIDDLE, SIDE
 from operators.simulator.classes import ACTIVITIES
 from operators.training import simulated_postures

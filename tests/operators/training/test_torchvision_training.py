@@ -80,7 +80,7 @@ def test_a_trained_detector_is_loaded_with_its_own_classes(data: Path, tmp_path:
     out = tmp_path / "mine.pth"
     told = trained(DETECTOR, data, out)
     assert told["weights"] == str(out)
-    assert {"ap50", "ap"} <= dict(told["scores"]).keys()  # type: ignore[call-overload]
+    assert {"ap50", "ap"} <= dict(told["scores"]).keys()
     detector = TorchvisionDetector(model=DETECTOR, checkpoint=str(out), score_threshold=0.0)
     detector.setup()
     found = detector.process(picture())
@@ -92,7 +92,7 @@ def test_a_trained_detector_is_loaded_with_its_own_classes(data: Path, tmp_path:
 def test_a_trained_segmenter_is_loaded_with_its_own_classes(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "masks.pth"
     told = trained(SEGMENTER, data, out, "--size", "64x64")
-    assert "miou" in dict(told["scores"])  # type: ignore[call-overload]
+    assert "miou" in dict(told["scores"])
     segmenter = TorchvisionSegmenter(model=SEGMENTER, checkpoint=str(out), side=64)
     segmenter.setup()
     assert segmenter.process(picture()).class_names == ("background", *NAMES)

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgpack
 
-from dataflow.transport.counters import Counters
+from dataflow.transport.publisher import Counters
 from simulation.world import Process, World
 
 Answer = Callable[[Any], object]

@@ -204,10 +204,10 @@ class Simulation:
             ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
             ("dataflow.transport.ring", "os"): system,
             ("dataflow.transport.fanout", "os"): SimpleNamespace(sched_yield=_nothing),  # greenlets need no core
-            (f"{supervision}.rings", "os"): system,
-            (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
+            (f"{supervision}.links", "os"): system,
+            (f"{supervision}.links", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
-            ("dataflow.sinks.live_sink", "let_others_begin"): _nothing,
+            ("dataflow.sinks.sink", "let_others_begin"): _nothing,
             (f"{process}.operator_process", "gc"): SimpleNamespace(freeze=lambda: None),  # processes end here
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
@@ -215,7 +215,7 @@ class Simulation:
             (f"{supervision}.supervisor", "Console"): _Shown,
             (f"{supervision}.supervisor", "LogFile"): _NoLog,
             (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
-            (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
+            (f"{supervision}.supervisor", "Reservation"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "signal"): machine.Signals(system),

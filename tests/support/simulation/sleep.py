@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from dataflow.execution.ready import Ready
+from dataflow.execution.driver import Ready
 from simulation.world import Violation, World
 
 
@@ -24,8 +24,8 @@ def watched(world: World) -> Iterator[None]:
                     world.violation = Violation(f"{runner.node.name} sleeps though its firing at {stamp} is decided")
         return worked
 
-    Ready.step = step  # type: ignore[method-assign]
+    Ready.step = step
     try:
         yield
     finally:
-        Ready.step = right  # type: ignore[method-assign]
+        Ready.step = right

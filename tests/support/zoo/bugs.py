@@ -98,9 +98,9 @@ class LateBatch(Operator):
 class EveryTenth(LateBatch, every="100ms"):
     """Raises: a batch of more than some messages."""
 
-    x: Batch[FeatureVector]  # type: ignore[assignment]
+    x: Batch[FeatureVector]
 
-    def process(self, x: tuple[FeatureVector, ...], rare: tuple[FeatureVector, ...]) -> FeatureVector:  # type: ignore[override]
+    def process(self, x: tuple[FeatureVector, ...], rare: tuple[FeatureVector, ...]) -> FeatureVector:
         if not fixed() and any(each.vectors[0, 0] == 444 for each in x):
             raise IndexError("no room")
         return vector(x[-1].stamp if x else STAMP, len(rare))

@@ -11,19 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    INTERRUPTED,
-    fail,
-    friendly_errors,
-    out,
-    print_json,
-    say,
-    seconds,
-    size,
-)
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, out, print_json, say, seconds, size
 
 if TYPE_CHECKING:
     from dataflow.cli.support.status_table import Row
@@ -39,26 +30,18 @@ FIRST_CALL = 10.0
 PORT = 9464
 HERE = Path()
 
-Folder = Annotated[
-    Path, typer.Option("--folder", metavar="DIR", help="Where recordings are written: its disk, here, is looked at.")
-]
+Folder = Annotated[Path, option("--folder DIR", "Where recordings are written: its disk, here, is looked at.")]
 
 
 def health(
     rate: Annotated[
-        list[str] | None,
-        typer.Option("--rate", metavar="OPERATOR=HZ", help="The least rate of an operator; may be repeated."),
+        list[str] | None, option("--rate OPERATOR=HZ", "The least rate of an operator; may be repeated.")
     ] = None,
-    losses: Annotated[
-        float, typer.Option("--losses", metavar="SHARE", help="Share of messages that an operator may drop.", min=0.0)
-    ] = 0.1,
-    free: Annotated[float, typer.Option("--free", metavar="GB", help="Free space on the disk.", min=0.0)] = 1.0,
+    losses: Annotated[float, option("--losses SHARE", "Share of messages that an operator may drop.", min=0.0)] = 0.1,
+    free: Annotated[float, option("--free GB", "Free space on the disk.", min=0.0)] = 1.0,
     folder: Folder = HERE,
-    over: Annotated[
-        float, typer.Option("--over", metavar="SECONDS", help="Time over which rates are taken.", min=0.1, max=600)
-    ] = 2.0,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    over: Annotated[float, option("--over SECONDS", "Time over which rates are taken.", min=0.1, max=600)] = 2.0,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Check whether a running graph does its work: for a watchdog, a container's health check, a cron job.
@@ -79,22 +62,21 @@ def health(
     from dataflow.client.attach import graph_of
     from dataflow.client.processes import processes_of
 
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        resolved = graph_of(found)
-        least = _rates(rate or (), resolved.nodes)
-        table = StatusTable(resolved)
-        with processes_of(found) as processes:
-            processes.connected(len(found.endpoints), CONNECT_WITHIN)
-            before = table.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
-            time.sleep(over)
-            statuses = processes.statuses(ANSWER_WITHIN)
-            sample = table.update(statuses, time.monotonic())
-        reasons = [
-            *faults(before.rows, sample.rows, least=least, losses=losses),
-            *silent(resolved, statuses, time.time() - found.started, over),
-            *_disk(folder, free),
-        ]
+    found = which.found()
+    resolved = graph_of(found)
+    least = _rates(rate or (), resolved.nodes)
+    table = StatusTable(resolved)
+    with processes_of(found) as processes:
+        processes.connected(len(found.endpoints), CONNECT_WITHIN)
+        before = table.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+        time.sleep(over)
+        statuses = processes.statuses(ANSWER_WITHIN)
+        sample = table.update(statuses, time.monotonic())
+    reasons = [
+        *faults(before.rows, sample.rows, least=least, losses=losses),
+        *silent(resolved, statuses, time.time() - found.started, over),
+        *_disk(folder, free),
+    ]
     if json:
         print_json({"graph": found.name, "healthy": not reasons, "reasons": reasons})
     else:
@@ -147,8 +129,7 @@ def silent(graph: Graph, statuses: Sequence[ProcessStatus], running: float, over
 
 
 def metrics(
-    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Of loopback; 0: a free one.")] = PORT,
-    folder: Folder = HERE,
+    port: Annotated[int, option("--port PORT", "Of loopback; 0: a free one.")] = PORT, folder: Folder = HERE
 ) -> None:
     """Serve figures of all graphs that run here to Prometheus, at http://127.0.0.1:PORT/metrics, until Ctrl-C.
 
@@ -164,18 +145,17 @@ def metrics(
     from dataflow.client.attach import listing
     from dataflow.client.metrics import MetricsServer, collect
 
-    with friendly_errors():
-        graphs = listing()
-        graphs()  # keys that are wrong are known at once
-        try:
-            server = MetricsServer(lambda: collect(graphs(), [folder]), port)
-        except OSError as error:
-            raise fail(f"cannot listen on port {port} of loopback: {error.strerror}") from None
-        say(f"http://127.0.0.1:{server.port}/metrics")
-        try:
-            server.serve()
-        except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+    graphs = listing()
+    graphs()  # keys that are wrong are known at once
+    try:
+        server = MetricsServer(lambda: collect(graphs(), [folder]), port)
+    except OSError as error:
+        raise fail(f"cannot listen on port {port} of loopback: {error.strerror}") from None
+    say(f"http://127.0.0.1:{server.port}/metrics")
+    try:
+        server.serve()
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
 
 
 def _rates(words: Sequence[str], operators: Mapping[str, object]) -> dict[str, float]:

@@ -15,12 +15,12 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_graphs, running_streams
-from dataflow.cli.support.arguments import FLAG, Json, chosen_streams
+from dataflow.cli.support.arguments import Json, chosen_streams
+from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import (
     INTERRUPTED,
     count,
     fail,
-    friendly_errors,
     out,
     plural,
     print_json,
@@ -37,19 +37,8 @@ if TYPE_CHECKING:
     from dataflow.transport import TapClient, TapMessage
     from dataflow.transport.registry import RunningGraph
 
-GraphName = Annotated[
-    str | None,
-    typer.Option(
-        "--graph",
-        metavar="NAME",
-        autocompletion=running_graphs,
-        help="Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
-    ),
-]
-Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
 Streams = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="STREAM...", autocompletion=running_streams, help="Streams; wildcards work. Default: all."),
+    list[str] | None, argument("STREAM...", "Streams; wildcards work. Default: all.", autocompletion=running_streams)
 ]
 
 GRAPH_VARIABLE = "DATAFLOW_GRAPH"
@@ -58,27 +47,43 @@ HISTORY = 2000
 """Messages of a stream over which its rates are taken, at most."""
 
 
-def running_graph(name: str | None, wait: float) -> RunningGraph:
-    """Returns the running graph of that name, or the only one; prints a note if it has to wait. Raises `NotRunning`."""
-    from dataflow.client.attach import NotRunning, find_running
+@dataclass(frozen=True, slots=True)
+class Running:
+    """Names a running graph."""
 
-    name = name or os.environ.get(GRAPH_VARIABLE) or None
-    if not 0 <= wait < 1e9:
-        raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
-    try:
-        return find_running(name)
-    except NotRunning:
-        if not wait:
-            raise
-    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else escape(name)} to run")
-    return find_running(name, wait=wait)
+    graph: Annotated[
+        str | None,
+        option(
+            "--graph NAME",
+            "Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
+            autocompletion=running_graphs,
+        ),
+    ] = None
+    wait: Annotated[float, option("--wait SECONDS", "Wait so long for the graph to run.")] = 0.0
+
+    def found(self) -> RunningGraph:
+        """The running graph of that name, or the only one; prints a note if it has to wait. Raises `NotRunning`."""
+        from dataflow.client.attach import NotRunning, find_running
+
+        name = self.graph or os.environ.get(GRAPH_VARIABLE) or None
+        if not 0 <= self.wait < 1e9:
+            raise fail(f"--wait {self.wait:g}: expected seconds, 0 or more")
+        try:
+            return find_running(name)
+        except NotRunning:
+            if not self.wait:
+                raise
+        say(f"waiting up to {seconds(self.wait)} for {'a graph' if name is None else escape(name)} to run")
+        return find_running(name, wait=self.wait)
+
+    def followed(self) -> RunningGraph:
+        """The same, which is named on standard error."""
+        found = self.found()
+        say_followed(found)
+        return found
 
 
-def followed_graph(name: str | None, wait: float) -> RunningGraph:
-    """The running graph of that name, or the only one, which it names. Raises `NotRunning`."""
-    found = running_graph(name, wait)
-    say_followed(found)
-    return found
+THE_ONLY = Running()
 
 
 def say_followed(found: RunningGraph) -> None:
@@ -87,11 +92,11 @@ def say_followed(found: RunningGraph) -> None:
 
 
 @contextmanager
-def tapped(streams: list[str] | None, name: str | None, wait: float) -> Iterator[tuple[RunningGraph, TapClient]]:
+def tapped(streams: list[str] | None, which: Running) -> Iterator[tuple[RunningGraph, TapClient]]:
     """The running graph, and a lossy copy of those of its streams that were asked for."""
     from dataflow.client.attach import graph_of, tap
 
-    found = followed_graph(name, wait)
+    found = which.followed()
     graph = graph_of(found)
     chosen = chosen_streams(streams, graph.streams, graph.namespace)
     with tap(found, [f"/{stream}" for stream in chosen] if streams else ["**"]) as client:
@@ -109,8 +114,7 @@ def list_running(json: Json = False) -> None:
     from dataflow.client.attach import graph_of
     from dataflow.transport.registry import running
 
-    with friendly_errors():
-        graphs = running()
+    graphs = running()
     if json:
         print_json([_listed(found) for found in graphs])
         return
@@ -151,20 +155,14 @@ def _listed(found: RunningGraph) -> dict[str, Any]:
 
 def echo(
     streams: Streams = None,
-    limit: Annotated[
-        int | None, typer.Option("--count", "-n", metavar="N", help="Stop after so many messages.")
-    ] = None,
-    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="Stop after one message: --count 1.")] = False,
+    limit: Annotated[int | None, option("--count -n N", "Stop after so many messages.")] = None,
+    once: Annotated[bool, option("--once", "Stop after one message: --count 1.")] = False,
     fields: Annotated[
-        list[str] | None,
-        typer.Option("--field", "-f", metavar="NAME", help="Print this field alone; may be given several times."),
+        list[str] | None, option("--field -f NAME", "Print this field alone; may be given several times.")
     ] = None,
-    full: Annotated[bool, typer.Option("--full", metavar=FLAG, help="Print long arrays and lists whole.")] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
-    json: Annotated[
-        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line: all data, numbers unrounded.")
-    ] = False,
+    full: Annotated[bool, option("--full", "Print long arrays and lists whole.")] = False,
+    which: Running = THE_ONLY,
+    json: Annotated[bool, option("--json", "One JSON object a line: all data, numbers unrounded.")] = False,
 ) -> None:
     """Print the messages of a running graph, as they come.
 
@@ -186,7 +184,7 @@ def echo(
         if limit not in (None, 1):
             raise fail(f"--once is --count 1; --count {limit} contradicts it")
         limit = 1
-    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, which) as (found, client):
         printed = 0
         try:
             while limit is None or printed < limit:
@@ -267,13 +265,9 @@ class _Rate:
 
 def hz(
     streams: Streams = None,
-    duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
-    window: Annotated[
-        float | None,
-        typer.Option("--window", metavar="SECONDS", help="Rates over the last so many seconds."),
-    ] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    duration: Annotated[float | None, option("--seconds SECONDS", "Stop after so long.")] = None,
+    window: Annotated[float | None, option("--window SECONDS", "Rates over the last so many seconds.")] = None,
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Show the rates of a running graph's streams.
@@ -294,7 +288,7 @@ def hz(
         raise fail(f"--window {window:g}: expected seconds, more than 0")
     rates: dict[str, _Rate] = {}
     stopped = False
-    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
+    with tapped(streams, which) as (found, client):
         deadline = None if duration is None else time.monotonic() + duration
         try:
             _measure(rates, found, client, deadline, window, shown=not json and out.is_terminal)

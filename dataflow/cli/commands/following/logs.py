@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,9 +13,10 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph, running_graph
-from dataflow.cli.support.arguments import FLAG, existing_recording
-from dataflow.cli.support.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
+from dataflow.cli.commands.following.live import THE_ONLY, Running
+from dataflow.cli.support.arguments import existing_recording
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import INTERRUPTED, fail, out, print_json_line, say
 
 if TYPE_CHECKING:
     from dataflow.recording import LogLine
@@ -25,31 +27,20 @@ _STYLES = {"debug": "dim", "info": "", "warning": "yellow", "error": "red", "fat
 
 _Operators = Annotated[
     list[str] | None,
-    typer.Option(
-        "--operator",
-        metavar="NAME",
-        autocompletion=running_operators,
-        help="Only this operator or process. May be repeated.",
-    ),
+    option("--operator NAME", "Only this operator or process. May be repeated.", autocompletion=running_operators),
 ]
 
 
 def logs(
     recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="[RECORDING|RUN]", help="A recording (.mcap), or the name of a running graph."),
+        Path | None, argument("[RECORDING|RUN]", "A recording (.mcap), or the name of a running graph.")
     ] = None,
     operators: _Operators = None,
-    level: Annotated[
-        str, typer.Option("--level", metavar="LEVEL", help="Only this level and worse: " + ", ".join(LEVELS) + ".")
-    ] = "debug",
-    follow: Annotated[
-        bool, typer.Option("--follow", "-f", metavar=FLAG, help="Go on with what comes, until the graph ends.")
-    ] = False,
-    last: Annotated[int | None, typer.Option("--last", "-n", metavar="N", help="Only the last N lines.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
-    json: Annotated[bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line.")] = False,
+    level: Annotated[str, option("--level LEVEL", "Only this level and worse: " + ", ".join(LEVELS) + ".")] = "debug",
+    follow: Annotated[bool, option("--follow -f", "Go on with what comes, until the graph ends.")] = False,
+    last: Annotated[int | None, option("--last -n N", "Only the last N lines.")] = None,
+    which: Running = THE_ONLY,
+    json: Annotated[bool, option("--json", "One JSON object a line.")] = False,
 ) -> None:
     """Show what operators have logged and printed: of the running graph, or of a recording.
 
@@ -70,23 +61,21 @@ def logs(
         raise fail(f"--last {last}: expected 1 or more")
     if last is not None and follow:
         raise fail("--last shows what is there, --follow what comes: leave one out")
-    with friendly_errors():
-        name = graph
-        if recording is not None and not recording.exists() and recording.suffix != ".mcap":
-            if graph is not None:
-                raise fail(f"{recording} and --graph {graph} both name a running graph; leave one out")
-            name, recording = str(recording), None
-        if recording is not None and (follow or graph is not None or wait):
-            raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
-        lines = _running(name, wait, follow=follow) if recording is None else _recorded(existing_recording(recording))
-        wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
-        shown = 0
-        try:
-            for line in _last(wanted, last):
-                shown += 1
-                _print(line, json=json)
-        except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+    if recording is not None and not recording.exists() and recording.suffix != ".mcap":
+        if which.graph is not None:
+            raise fail(f"{recording} and --graph {which.graph} both name a running graph; leave one out")
+        which, recording = replace(which, graph=str(recording)), None
+    if recording is not None and (follow or which != THE_ONLY):
+        raise fail("--follow, --graph and --wait are about a running graph; leave them out for a recording")
+    lines = _running(which, follow=follow) if recording is None else _recorded(existing_recording(recording))
+    wanted = (line for line in lines if _is_wanted(line, operators, LEVELS.index(level)))
+    shown = 0
+    try:
+        for line in _last(wanted, last):
+            shown += 1
+            _print(line, json=json)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
     if not shown and not json:
         _report_nothing(recording, operators, level)
 
@@ -128,13 +117,13 @@ def _report_unknown(path: Path, names: list[str]) -> None:
             say(f"[yellow]no operator or process {escape(repr(name))} is in the recording:[/] {escape(hint)}")
 
 
-def _running(name: str | None, wait: float, *, follow: bool) -> Iterator[LogLine]:
+def _running(which: Running, *, follow: bool) -> Iterator[LogLine]:
     """The lines of a running graph; with `follow` until it has ended."""
     from dataflow.client.attach import still_runs
     from dataflow.recording import LogLine
     from dataflow.transport.log_file import LogFollower
 
-    found = followed_graph(name, wait) if follow else running_graph(name, wait)
+    found = which.followed() if follow else which.found()
     follower = LogFollower(found.pid)
     try:
         while True:

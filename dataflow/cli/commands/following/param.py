@@ -6,36 +6,26 @@ import json as json_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
-from dataflow.cli.support.arguments import FLAG, Json, OutInstead, existing, find_modules_in, named_once
-from dataflow.cli.support.output import (
-    DIFFERENT,
-    fail,
-    friendly_errors,
-    out,
-    print_json,
-    print_json_line,
-    say,
-    table,
-)
+from dataflow.cli.commands.following.live import THE_ONLY, Running
+from dataflow.cli.support.arguments import Json, OutInstead, existing, find_modules_in, named_once
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, fail, out, print_json, print_json_line, say, table
 from dataflow.text import jsonable
 
 if TYPE_CHECKING:
     from dataflow.client.processes import Parameter
     from dataflow.graph import Graph
 
-Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.")]
+Timeout = Annotated[float, option("--timeout SECONDS", "Wait so long for an answer.")]
 
 
 def set_(
-    parameter: Annotated[str, typer.Argument(metavar="OPERATOR.NAME", help="Such as detector.score_threshold.")],
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="A YAML value: 0.3, true, near, [1, 2].")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    parameter: Annotated[str, argument("OPERATOR.NAME", "Such as detector.score_threshold.")],
+    value: Annotated[str, argument("VALUE", "A YAML value: 0.3, true, near, [1, 2].")],
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -52,20 +42,16 @@ def set_(
       dataflow param set detector.score_threshold 0.5
       dataflow param set front/cloud.stride 4 --graph two_cameras
     """
-    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.client.processes import processes_of
 
     _check(timeout)
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        operator, name = _split(parameter, _graph(found))
-        if not name:
-            raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
-        wanted = _value(value)
-        with processes_of(found) as processes:
-            try:
-                taken = processes.set_parameter(operator, name, wanted, timeout)
-            except (Refused, NoAnswer) as error:
-                raise fail(str(error), code=DIFFERENT) from None
+    found = which.found()
+    operator, name = _split(parameter, _graph(found))
+    if not name:
+        raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
+    wanted = _value(value)
+    with processes_of(found) as processes:
+        taken = processes.set_parameter(operator, name, wanted, timeout)
     if json:
         print_json({"operator": operator, "name": name, "value": taken})
     else:
@@ -73,11 +59,8 @@ def set_(
 
 
 def get(
-    parameter: Annotated[
-        str | None, typer.Argument(metavar="OPERATOR[.NAME]", help="One parameter, or all of an operator.")
-    ] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    parameter: Annotated[str | None, argument("OPERATOR[.NAME]", "One parameter, or all of an operator.")] = None,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -93,8 +76,7 @@ def get(
     """
     from dataflow.graph.problems import did_you_mean
 
-    with friendly_errors():
-        operators, name, values = _asked(parameter, graph, wait, timeout)
+    operators, name, values = _asked(parameter, which, timeout)
     if name:
         for operator, parameters in values.items():
             if name not in parameters:
@@ -115,11 +97,8 @@ def get(
 
 
 def list_(
-    every: Annotated[
-        bool, typer.Option("--all", metavar=FLAG, help="Also those that cannot change while the graph runs.")
-    ] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    every: Annotated[bool, option("--all", "Also those that cannot change while the graph runs.")] = False,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
     json: Json = False,
 ) -> None:
@@ -130,10 +109,9 @@ def list_(
       dataflow param list
       dataflow param list --all --json
     """
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        resolved = _graph(found)
-        operators, _, values = _asked(None, graph, wait, timeout)
+    found = which.found()
+    resolved = _graph(found)
+    operators, _, values = _asked(None, which, timeout)
     rows = [
         {"parameter": f"{op}.{name}", "value": p.value, "tunable": p.tunable, **_declared(resolved, op, name)}
         for op, parameters in values.items()
@@ -154,16 +132,11 @@ def list_(
 
 
 def dump(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="FILE", help="A YAML file to write. Default: print it.")
-    ] = None,
+    file: Annotated[Path | None, argument("FILE", "A YAML file to write. Default: print it.")] = None,
     out_option: OutInstead = None,
-    every: Annotated[
-        bool, typer.Option("--all", metavar=FLAG, help="Also those that cannot change while the graph runs.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    every: Annotated[bool, option("--all", "Also those that cannot change while the graph runs.")] = False,
+    overwrite: Annotated[bool, option("--overwrite", "Replace a file that exists.")] = False,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
 ) -> None:
     """Write the values that parameters have now as YAML: operator, name, value. `param load` sets them again.
@@ -178,8 +151,7 @@ def dump(
     file = named_once("FILE", file, out_option)
     if file is not None and file.exists() and not overwrite:
         raise fail(f"{file} exists; name another file, or replace it with --overwrite")
-    with friendly_errors():
-        operators, _, values = _asked(None, graph, wait, timeout)
+    operators, _, values = _asked(None, which, timeout)
     lines: list[str] = []
     for operator, parameters in values.items():
         shown = {name: p.value for name, p in parameters.items() if p.tunable or every}
@@ -190,15 +162,13 @@ def dump(
     if file is None:
         out.print(Text(text), end="", soft_wrap=True)
     else:
-        with friendly_errors():
-            file.write_text(text, encoding="utf-8")
+        file.write_text(text, encoding="utf-8")
     _say_who_is_missing(operators, values, timeout)
 
 
 def load(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="YAML as `param dump` writes it.")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    file: Annotated[Path, argument("FILE", "YAML as `param dump` writes it.")],
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
 ) -> None:
     """Set the parameters that a file names, as far as their values differ.
@@ -211,32 +181,28 @@ def load(
 
       dataflow param load tuned.yaml
     """
-    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.client.processes import processes_of
     from dataflow.graph.problems import did_you_mean
 
-    with friendly_errors():
-        wanted = _read_values(existing(file, "a YAML file of parameters"))
-        found = running_graph(graph, wait)
-        for operator in wanted:
-            _split(operator, _graph(found))
-        _check(timeout)
-        with processes_of(found) as processes:
-            present = processes.parameters(list(wanted), timeout)
-            _say_who_is_missing(list(wanted), present, timeout)
-            changes = []
-            for operator, values in wanted.items():
-                for name, value in values.items():
-                    if name not in present[operator]:
-                        known = did_you_mean(name, present[operator], "its parameters")
-                        raise fail(f"{file}: {operator!r} has no parameter {name!r}: {known}")
-                    if jsonable(present[operator][name].value) != value:
-                        changes.append((operator, name, value))
-            for operator, name, value in changes:
-                try:
-                    taken = processes.set_parameter(operator, name, value, timeout)
-                except (Refused, NoAnswer) as error:
-                    raise fail(str(error), code=DIFFERENT) from None
-                out.print(Text(f"{operator}.{name} = {_text(taken)}"), soft_wrap=True)
+    wanted = _read_values(existing(file, "a YAML file of parameters"))
+    found = which.found()
+    for operator in wanted:
+        _split(operator, _graph(found))
+    _check(timeout)
+    with processes_of(found) as processes:
+        present = processes.parameters(list(wanted), timeout)
+        _say_who_is_missing(list(wanted), present, timeout)
+        changes = []
+        for operator, values in wanted.items():
+            for name, value in values.items():
+                if name not in present[operator]:
+                    known = did_you_mean(name, present[operator], "its parameters")
+                    raise fail(f"{file}: {operator!r} has no parameter {name!r}: {known}")
+                if jsonable(present[operator][name].value) != value:
+                    changes.append((operator, name, value))
+        for operator, name, value in changes:
+            taken = processes.set_parameter(operator, name, value, timeout)
+            out.print(Text(f"{operator}.{name} = {_text(taken)}"), soft_wrap=True)
     if not changes:
         say("every parameter has the value of the file already")
 
@@ -290,14 +256,12 @@ def _value(text: str, shown: str = "") -> Any:
     return value
 
 
-def _asked(
-    word: str | None, name: str | None, wait: float, timeout: float
-) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
+def _asked(word: str | None, which: Running, timeout: float) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
     """The operators that were asked, the parameter (or none), and what they answered."""
     from dataflow.client.processes import processes_of
 
     _check(timeout)
-    found = running_graph(name, wait)
+    found = which.found()
     graph = _graph(found)
     operator, parameter = ("", "") if word is None else _split(word, graph)
     operators = [operator] if operator else list(graph.nodes)

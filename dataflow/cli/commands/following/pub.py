@@ -12,10 +12,11 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.completion import running_operators
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.commands.following.param import Timeout, _check, _value
 from dataflow.cli.support.arguments import number
-from dataflow.cli.support.output import DIFFERENT, INTERRUPTED, fail, friendly_errors, out, print_json_line
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import INTERRUPTED, fail, out, print_json_line
 
 if TYPE_CHECKING:
     from dataflow.client.processes import Processes, Taker
@@ -26,26 +27,16 @@ OURS = ("stream", "type")
 
 
 def pub(
-    operator: Annotated[
-        str,
-        typer.Argument(metavar="OPERATOR", help="A source of `dataflow.remote`.", autocompletion=running_operators),
-    ],
-    fields: Annotated[
-        str,
-        typer.Argument(metavar="FIELDS", help="Its fields as YAML or JSON; `-`: lines of JSON from standard input."),
-    ],
-    count: Annotated[int | None, typer.Option("--count", "-n", metavar="N", help="Give it so many times.")] = None,
+    operator: Annotated[str, argument("OPERATOR", "A source of `dataflow.remote`.", autocompletion=running_operators)],
+    fields: Annotated[str, argument("FIELDS", "Its fields as YAML or JSON; `-`: lines of JSON from standard input.")],
+    count: Annotated[int | None, option("--count -n N", "Give it so many times.")] = None,
     rate: Annotated[
-        float | None,
-        typer.Option("--rate", metavar="HZ", parser=number(0.001, 1000, "messages a second"), help="Again and again."),
+        float | None, option("--rate HZ", "Again and again.", parser=number(0.001, 1000, "messages a second"))
     ] = None,
-    stamp: Annotated[
-        int | None, typer.Option("--stamp", metavar="NS", help="Its timestamp. Default: the graph's event time of now.")
-    ] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    stamp: Annotated[int | None, option("--stamp NS", "Its timestamp. Default: the graph's event time of now.")] = None,
+    which: Running = THE_ONLY,
     timeout: Timeout = 5.0,
-    json: Annotated[bool, typer.Option("--json", metavar=" ", help="One JSON object a message.")] = False,
+    json: Annotated[bool, option("--json", "One JSON object a message.")] = False,
 ) -> None:
     """Give a message to a live graph, for a test or by hand.
 
@@ -62,7 +53,7 @@ def pub(
       dataflow pub desk - --rate 10 < lines.jsonl
     """
     from dataflow.client.attach import graph_of, types_of
-    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.client.processes import processes_of
 
     _check(timeout)
     if count is not None and count < 1:
@@ -71,20 +62,17 @@ def pub(
         raise fail("--stamp is that of one message; leave --rate and --count out")
     if stamp is not None and not 0 < stamp < 2**63:
         raise fail(f"--stamp {stamp}: expected nanoseconds, above 0")
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        with processes_of(found) as processes:
-            taker = _taker(processes, operator, [*graph_of(found).nodes], len(found.endpoints), timeout)
-            kind = types_of(graph_of(found))(taker.types[0])
-            messages = _messages(kind, fields, stamp or 0, count, rate)
-            try:
-                for message in _paced(messages, rate):
-                    given = processes.publish(operator, message, timeout)
-                    _say(operator, taker, given, json=json)
-            except (Refused, NoAnswer) as error:
-                raise fail(str(error), code=DIFFERENT) from None
-            except KeyboardInterrupt:
-                raise typer.Exit(INTERRUPTED) from None
+    found = which.found()
+    with processes_of(found) as processes:
+        taker = _taker(processes, operator, [*graph_of(found).nodes], len(found.endpoints), timeout)
+        kind = types_of(graph_of(found))(taker.types[0])
+        messages = _messages(kind, fields, stamp or 0, count, rate)
+        try:
+            for message in _paced(messages, rate):
+                given = processes.publish(operator, message, timeout)
+                _say(operator, taker, given, json=json)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
 
 
 def _taker(processes: Processes, operator: str, known: Iterable[str], number: int, timeout: float) -> Taker:

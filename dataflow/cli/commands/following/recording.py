@@ -9,26 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Streams, Wait, running_graph, say_followed
-from dataflow.cli.support.arguments import FLAG, Json, Overwrite, chosen_streams
-from dataflow.cli.support.material import Compression
-from dataflow.cli.support.output import (
-    count,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    say,
-    seconds,
-    size,
-    table,
-)
+from dataflow.cli.commands.following.live import THE_ONLY, Running, Streams, say_followed
+from dataflow.cli.support.arguments import Json, Overwrite, chosen_streams
+from dataflow.cli.support.edited_files import Compression
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import count, err, fail, out, plural, print_json, say, seconds, size, table
 from dataflow.cli.support.storage import MODES, Readable, SplitEvery, SplitSize, named, recording_file, splitting_of
 
 if TYPE_CHECKING:
@@ -39,19 +27,17 @@ if TYPE_CHECKING:
 
 def record(
     streams: Streams = None,
-    output: Annotated[
-        Path,
-        typer.Option("--out", "-o", metavar="OUT.mcap", help="The file to write; NAME_000.mcap and so on if split."),
-    ] = Path("recording.mcap"),
+    output: Annotated[Path, option("--out -o OUT.mcap", "The file to write; NAME_000.mcap and so on if split.")] = Path(
+        "recording.mcap"
+    ),
     split_every: SplitEvery = None,
     split_size: SplitSize = None,
     readable: Readable = "owner",
     compression: Compression = "zstd",
-    duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    duration: Annotated[float | None, option("--seconds SECONDS", "Stop after so long.")] = None,
+    which: Running = THE_ONLY,
     overwrite: Overwrite = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")] = False,
+    quiet: Annotated[bool, option("--quiet -q", "Show no progress.")] = False,
     json: Json = False,
 ) -> None:
     """Record streams of a graph that runs already.
@@ -78,24 +64,23 @@ def record(
     from dataflow.client.recorder import AttachedRecorder, subscribed
     from dataflow.client.recorder import record as write
 
-    with friendly_errors():
-        splitting = splitting_of(split_every, split_size)
-        if duration is not None and not 0 < duration < 1e9:
-            raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
-        output = recording_file(named(output), splitting, overwrite=overwrite, option="--out")
-        found = running_graph(graph, wait)
-        if not quiet:
-            say_followed(found)
-        running = graph_of(found)
-        chosen = chosen_streams(streams, running.streams, running.namespace)
-        made = partial(AttachedRecorder, splitting=splitting, compression=compression, mode=MODES[readable])
-        with (
-            subscribed(found, chosen) as subscription,
-            made(output, running, chosen, metadata=_metadata(running), overwrite=overwrite) as recorder,
-            _shown(recorder.tally, quiet or json) as show,
-        ):
-            write(subscription, recorder, goes_on=_until_over(found, duration, show))
-        _report(recorder.tally, json=json)
+    splitting = splitting_of(split_every, split_size)
+    if duration is not None and not 0 < duration < 1e9:
+        raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
+    output = recording_file(named(output), splitting, overwrite=overwrite, option="--out")
+    found = which.found()
+    if not quiet:
+        say_followed(found)
+    running = graph_of(found)
+    chosen = chosen_streams(streams, running.streams, running.namespace)
+    made = partial(AttachedRecorder, splitting=splitting, compression=compression, mode=MODES[readable])
+    with (
+        subscribed(found, chosen) as subscription,
+        made(output, running, chosen, metadata=_metadata(running), overwrite=overwrite) as recorder,
+        _shown(recorder.tally, quiet or json) as show,
+    ):
+        write(subscription, recorder, goes_on=_until_over(found, duration, show))
+    _report(recorder.tally, json=json)
 
 
 def _metadata(running: Graph) -> dict[str, dict[str, str]]:
@@ -156,9 +141,8 @@ def _report(tally: Tally, *, json: bool) -> None:
 
 
 def trigger(
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="Why; it goes into the recording.")] = "asked for",
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    text: Annotated[str, argument("TEXT", "Why; it goes into the recording.")] = "asked for",
+    which: Running = THE_ONLY,
     json: Json = False,
 ) -> None:
     """Save the flight recorder's history.
@@ -180,11 +164,10 @@ def trigger(
     from dataflow.client.attach import graph_of
     from dataflow.client.trigger import trigger as ask
 
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        ask(found, text)
-        flight = graph_of(found).record.flight
-        assert flight is not None
+    found = which.found()
+    ask(found, text)
+    flight = graph_of(found).record.flight
+    assert flight is not None
     if json:
         print_json({"graph": found.name, "text": text, "folder": flight.folder, "keep": flight.keep})
         return

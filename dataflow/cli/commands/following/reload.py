@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, running_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import Json, find_modules_in
-from dataflow.cli.support.output import DIFFERENT, fail, friendly_errors, out, print_json, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import DIFFERENT, fail, out, print_json, say
 
 
 def reload(
-    operator: Annotated[str, typer.Argument(metavar="OPERATOR", help="Its name in the graph, such as detector.")],
-    graph: GraphName = None,
-    wait: Wait = 0.0,
-    timeout: Annotated[
-        float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.", min=0.1)
-    ] = 90.0,
+    operator: Annotated[str, argument("OPERATOR", "Its name in the graph, such as detector.")],
+    which: Running = THE_ONLY,
+    timeout: Annotated[float, option("--timeout SECONDS", "Wait so long for an answer.", min=0.1)] = 90.0,
     json: Json = False,
 ) -> None:
     """Let an operator of a live run go on with its code as it is in its files now.
@@ -43,29 +40,28 @@ def reload(
     from dataflow.client.processes import NoAnswer, Refused, processes_of
     from dataflow.graph.problems import did_you_mean
 
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        nodes = graph_of(found).nodes
-        if operator not in nodes:
-            raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, nodes, 'there are')}")
-        if with_keys_of_tools():
-            why = "these are keys of tools, which load no code: take those of the machine that runs the graph"
-            raise fail(f"{operator} is not reloaded: {why}", code=DIFFERENT)
-        with processes_of(found) as processes:
-            try:
-                if (machine := nodes[operator].machine) is not None:
-                    _require_same_files(processes.files(operator, timeout), machine)
-                outcome = processes.reload(operator, timeout)
-            except (Refused, NoAnswer) as error:
-                raise fail(f"{operator} is not reloaded: {error}", code=DIFFERENT) from None
+    found = which.found()
+    nodes = graph_of(found).nodes
+    if operator not in nodes:
+        raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, nodes, 'there are')}")
+    if with_keys_of_tools():
+        why = "these are keys of tools, which load no code: take those of the machine that runs the graph"
+        raise fail(f"{operator} is not reloaded: {why}", code=DIFFERENT)
+    with processes_of(found) as processes:
+        try:
+            if (machine := nodes[operator].machine) is not None:
+                _require_same_files(processes.files(operator, timeout), machine)
+            outcome = processes.reload(operator, timeout)
+        except (Refused, NoAnswer) as error:
+            raise fail(f"{operator} is not reloaded: {error}", code=DIFFERENT) from None
     if outcome["warning"]:
         say(escape(outcome["warning"]))
     if json:
         print_json({"operator": operator, **outcome})
     else:
         where = f" on machine {machine}, to which no code is sent" if machine else ""
-        which = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
-        text = f"{operator} goes on with {which} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
+        code = "new code" if outcome["changed"] else f"the code that it had: no file of it has changed{where},"
+        text = f"{operator} goes on with {code} after {outcome['seconds']:.2g} s; its state: {outcome['state']}"
         out.print(Text(text), soft_wrap=True)
 
 

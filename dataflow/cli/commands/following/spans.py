@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
+from dataflow.cli.commands.following.live import THE_ONLY, Running
 from dataflow.cli.support.arguments import ModuleFolders, Overwrite, existing_recording, find_modules_in, output_file
-from dataflow.cli.support.output import INTERRUPTED, count, fail, friendly_errors, say
+from dataflow.cli.support.options import argument, option
+from dataflow.cli.support.output import INTERRUPTED, count, fail, say
 
 if TYPE_CHECKING:
     from dataflow.client.span_sender import SpanSender
@@ -30,22 +31,16 @@ NOTE_EVERY = 10.0
 
 def spans(
     recording: Annotated[
-        Path | None, typer.Argument(metavar="RECORDING", help="A recording (.mcap). Without one: the running graph.")
+        Path | None, argument("RECORDING", "A recording (.mcap). Without one: the running graph.")
     ] = None,
     to: Annotated[
         str,
-        typer.Option(
-            "--to",
-            "--out",
-            "-o",
-            metavar="TARGET",
-            help="FILE.jsonl, or the URL of a collector (http://127.0.0.1:4318).",
-            show_default=False,
+        option(
+            "--to --out -o TARGET", "FILE.jsonl, or the URL of a collector (http://127.0.0.1:4318).", show_default=False
         ),
     ] = "",
     folders: ModuleFolders = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
+    which: Running = THE_ONLY,
     overwrite: Overwrite = False,
 ) -> None:
     """Give every firing as a span of OpenTelemetry, to a file or a collector (OTLP in JSON over HTTP).
@@ -64,15 +59,14 @@ def spans(
       dataflow spans --to http://127.0.0.1:4318
       dataflow spans --graph robot --wait 30 --to robot.jsonl
     """
-    if recording is not None and (graph is not None or wait):
+    if recording is not None and which != THE_ONLY:
         raise fail("--graph and --wait are about a running graph; leave them out for a recording")
     find_modules_in(folders)
-    with friendly_errors():
-        write = _target(to, overwrite)
-        if recording is not None:
-            _export(recording, write, to)
-        else:
-            _follow(followed_graph(graph, wait), write, to)
+    write = _target(to, overwrite)
+    if recording is not None:
+        _export(recording, write, to)
+    else:
+        _follow(which.followed(), write, to)
 
 
 def _target(to: str, overwrite: bool) -> Callable[[str], int]:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.commands.following.live import GraphName, Wait, followed_graph
-from dataflow.cli.support.arguments import FLAG
-from dataflow.cli.support.output import INTERRUPTED, err, fail, friendly_errors, out, print_json
+from dataflow.cli.commands.following.live import THE_ONLY, Running
+from dataflow.cli.support.options import option
+from dataflow.cli.support.output import INTERRUPTED, err, fail, out, print_json
 
 if TYPE_CHECKING:
     from dataflow.cli.support.status_table import Sample
@@ -27,11 +27,10 @@ FIRST_AFTER = 0.1
 
 
 def top(
-    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="Print one table and end.")] = False,
-    every: Annotated[float, typer.Option("--every", metavar="SECONDS", help="Time between two updates.")] = 1.0,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
-    json: Annotated[bool, typer.Option("--json", metavar=FLAG, help="Print one sample as JSON and end.")] = False,
+    once: Annotated[bool, option("--once", "Print one table and end.")] = False,
+    every: Annotated[float, option("--every SECONDS", "Time between two updates.")] = 1.0,
+    which: Running = THE_ONLY,
+    json: Annotated[bool, option("--json", "Print one sample as JSON and end.")] = False,
 ) -> None:
     """Show the status of every operator of a running graph, and the latency of every path through it.
 
@@ -59,19 +58,18 @@ def top(
 
     if not 0.05 <= every < 1e6:
         raise fail(f"--every {every:g}: expected seconds, 0.05 or more")
-    with friendly_errors():
-        found = followed_graph(graph, wait)
-        with processes_of(found) as processes:
-            processes.connected(len(found.endpoints), CONNECT_WITHIN)
-            try:
-                if once or json:
-                    _print_one(found, processes, every, json=json)
-                elif out.is_terminal:
-                    _follow(found, processes, every)
-                else:
-                    _print_lines(found, processes, every)
-            except KeyboardInterrupt:
-                raise typer.Exit(INTERRUPTED) from None
+    found = which.followed()
+    with processes_of(found) as processes:
+        processes.connected(len(found.endpoints), CONNECT_WITHIN)
+        try:
+            if once or json:
+                _print_one(found, processes, every, json=json)
+            elif out.is_terminal:
+                _follow(found, processes, every)
+            else:
+                _print_lines(found, processes, every)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
     if not (once or json):
         err.print(Text(f"{found.name} has ended"))
 

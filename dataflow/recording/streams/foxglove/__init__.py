@@ -7,6 +7,8 @@ the protobuf holds.
 
 from __future__ import annotations
 
+from functools import partial
+
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as CompressedImageProto
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo as CompressedVideoProto
@@ -37,17 +39,18 @@ from dataflow.messages import (
     Transforms,
 )
 from dataflow.recording.streams.foxglove import clouds, images, poses, readings
-from dataflow.recording.streams.foxglove.schema import FoxgloveSchema, file_descriptor_set
+from dataflow.recording.streams.foxglove.schema import FoxgloveSchema, file_descriptor_set, parsed
 from dataflow.recording.streams.foxglove.values import Parts, stamp_of
+from dataflow.recording.streams.pixels import as_depth, as_image, as_image16
 
-__all__ = ["FOXGLOVE_SCHEMAS", "FoxgloveSchema", "Parts", "file_descriptor_set", "stamp_of"]
+__all__ = ["FOXGLOVE_SCHEMAS", "FoxgloveSchema", "Parts", "file_descriptor_set", "parsed", "stamp_of"]
 
 FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
     schema.message: schema
     for schema in (
-        FoxgloveSchema(Image, RawImage, images.encode_image, images.decode_image),
-        FoxgloveSchema(Image16, RawImage, images.encode_image16, images.decode_image16),
-        FoxgloveSchema(DepthImage, RawImage, images.encode_depth, images.decode_depth),
+        FoxgloveSchema(Image, RawImage, images.encode_image, partial(images.decode_raw, as_image)),
+        FoxgloveSchema(Image16, RawImage, images.encode_image16, partial(images.decode_raw, as_image16)),
+        FoxgloveSchema(DepthImage, RawImage, images.encode_depth, partial(images.decode_raw, as_depth)),
         FoxgloveSchema(CompressedImage, CompressedImageProto, images.encode_compressed, images.decode_compressed),
         FoxgloveSchema(CompressedVideo, CompressedVideoProto, images.encode_video, images.decode_video),
         FoxgloveSchema(

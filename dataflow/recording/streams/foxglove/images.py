@@ -16,13 +16,7 @@ from dataflow.messages import CameraInfo, CompressedImage, CompressedVideo, Dept
 from dataflow.messages.images import VIDEO_FORMATS
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
-from dataflow.recording.streams.pixels import (
-    as_depth,
-    as_image,
-    as_image16,
-    as_millimetres,
-    stored_rows,
-)
+from dataflow.recording.streams.pixels import as_millimetres, stored_rows
 
 UINT32_MAX = 2**32 - 1
 
@@ -50,24 +44,13 @@ def encode_image16(message: Image16) -> tuple[Parts, tuple[str, ...]]:
     return _raw_image(message, "rgb16" if message.data.ndim == 3 else "mono16", message.data)
 
 
-def decode_image16(proto: RawImage) -> Fields:
-    return _decoded(proto, as_image16)
-
-
 def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
     whole = as_millimetres(message.data)
     return _raw_image(message, "32FC1", message.data) if whole is None else _raw_image(message, "16UC1", whole)
 
 
-def decode_image(proto: RawImage) -> Fields:
-    return _decoded(proto, as_image)
-
-
-def decode_depth(proto: RawImage) -> Fields:
-    return _decoded(proto, as_depth)
-
-
-def _decoded(proto: RawImage, pixels_of: Callable[[str, npt.NDArray[Any]], npt.NDArray[Any]]) -> Fields:
+def decode_raw(pixels_of: Callable[[str, npt.NDArray[Any]], npt.NDArray[Any]], proto: RawImage) -> Fields:
+    """The fields of an image, its pixels by its encoding."""
     data = np.frombuffer(proto.data, np.uint8)
     pixels = pixels_of(proto.encoding, stored_rows(proto.encoding, proto.width, proto.height, proto.step, data))
     pixels.flags.writeable = False
@@ -91,11 +74,7 @@ def encode_video(message: CompressedVideo) -> tuple[Parts, tuple[str, ...]]:
 
 
 def decode_video(proto: CompressedVideoProto) -> Fields:
-    return {
-        "frame": proto.frame_id,
-        "format": video_format(proto.format),
-        "data": np.frombuffer(proto.data, np.uint8),
-    }
+    return {"frame": proto.frame_id, "format": video_format(proto.format), "data": np.frombuffer(proto.data, np.uint8)}
 
 
 def video_format(named: str) -> str:

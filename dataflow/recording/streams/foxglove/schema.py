@@ -34,12 +34,17 @@ class FoxgloveSchema:
 
     def parse(self, data: Any) -> Any:
         """The protobuf object; raises `RecordingError`."""
-        parsed = self.proto()
-        try:
-            parsed.ParseFromString(data)
-        except DecodeError as error:
-            raise RecordingError(f"not a {self.name}: {error}") from error
-        return parsed
+        return parsed(self.proto, data)
+
+
+def parsed(proto: type[Any], data: Any) -> Any:
+    """An object of a protobuf class; raises `RecordingError`."""
+    made = proto()
+    try:
+        made.ParseFromString(data)
+    except DecodeError as error:
+        raise RecordingError(f"not a {proto.DESCRIPTOR.full_name}: {error}") from error
+    return made
 
 
 def file_descriptor_set(proto: type[Any]) -> bytes:

@@ -19,7 +19,7 @@ from dataflow.supervision.core.run_state import Phase, RunState
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.leftover_records import LeftoverRecords
 from dataflow.supervision.core.watchers.watcher import Watcher
-from dataflow.supervision.rings import pairs_of
+from dataflow.supervision.links import pairs_of
 
 EDGES_WITHIN = 5.0
 RECORDER = Restart(max=5, backoff=1_000_000_000)

@@ -24,9 +24,9 @@ from operators.fusion.filter.error_state import (
     propagated,
     updated,
 )
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node, rests
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import (
     AngularRate,
     FullPose,
@@ -138,7 +138,9 @@ RATE = 50
 PRIOR = Prior(heading=0.0, heading_sigma=0.1, gyro_bias=0.02, accel_bias=0.1, position_sigma=0.5)
 
 
-def run(seed: int, checks: list[float], outage: tuple[float, float] = (9.0, 9.0)) -> tuple[list[Array], LateFilter]:
+def run(
+    seed: int, checks: list[float], outage: tuple[float, float] = (9.0, 9.0)
+) -> tuple[list[Array], ErrorStateFilter]:
     """Errors (6,) over their covariance at some times, of one run with everything drawn as the filter is told."""
     made = np.random.default_rng(seed)
     motion = Motion(phase=0.1 * made.standard_normal())
@@ -155,7 +157,7 @@ def run(seed: int, checks: list[float], outage: tuple[float, float] = (9.0, 9.0)
     samples = [Sample(round(x * 1e9), w, f, NOISE) for x, w, f in zip(t, gyro, accel, strict=True)]
     begin = int(0.5 * RATE)
     node = first_node(samples[:begin], prior, 9.80665, at_rest=True)
-    filter = LateFilter(FilterConfig(window=0.3), node)
+    filter = ErrorStateFilter(FilterConfig(window=0.3), node)
     nees = []
     for k in range(begin, len(t)):
         filter.feel(samples[k])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from operators.fusion.filter.error_state import POSITION, VELOCITY
-from operators.fusion.filter.far import FARTHEST, bounded
+from operators.fusion.filter.error_state_filter import FARTHEST, bounded
 
 
 @pytest.mark.parametrize(("metres", "kept", "far"), [(900.0, 900.0, False), (5000.0, FARTHEST, True)])

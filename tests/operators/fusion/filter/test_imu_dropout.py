@@ -22,16 +22,13 @@ def played(robot: Robot, imu: list[Any]) -> Played:
         "robot/seen": robot.poses(Odometry, frame="odom"),
         "robot/pose": [p for p in robot.poses() if p.stamp < BEGIN],
     }
-    sensors = {
-        "robot/seen": {"use": "velocity", "sigma": 0.03, "angular_sigma": 0.02},
-        "robot/pose": {"use": "pose"},
-    }
+    sensors = {"robot/seen": {"use": "velocity", "sigma": 0.03, "angular_sigma": 0.02}, "robot/pose": {"use": "pose"}}
     return fused(streams, sensors=sensors, heading=None)[1]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["dropped", "off"])
-def test_poses_go_on_where_the_inertial_sensor_is_silent_and_it_is_said(kind: str) -> None:
+def test_poses_go_on_without_the_inertial_sensor_and_the_status_reports_it(kind: str) -> None:
     robot, imu = Robot(8.0), []
     for sample in robot.imu:
         if not BEGIN <= sample.stamp < END:

@@ -1,4 +1,4 @@
-"""Late stamps and wrong scales that nobody told are found in a window of what was felt and measured."""
+"""Late stamps and wrong scales are found in a window of inertial samples and measurements."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from operators.fusion.filter.error_state import (
     moved,
     propagated,
 )
+from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterConfig
 from operators.fusion.filter.history import Hypothesis, Node, Sample
-from operators.fusion.filter.late_filter import FilterConfig, LateFilter
 from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
 from operators.fusion.filter.suspicions import LATE, SCALE, Fit, Suspicions, suspected
@@ -74,7 +74,6 @@ def looked(window: Window, errors: SensorErrors | None = None) -> Suspicions:
 
 def test_late_stamps_are_found_though_the_estimate_took_them_for_a_heading() -> None:
     found = looked(Drive().window(late=0.5)).found
-    assert found is not None
     sensor, kind, size, sigma = found
     assert (sensor, kind) == DELAYS
     assert abs(size - 0.5) < 3 * sigma < 0.15
@@ -83,7 +82,6 @@ def test_late_stamps_are_found_though_the_estimate_took_them_for_a_heading() -> 
 @pytest.mark.parametrize(("late", "fast", "expected"), [(0.4, 1.0, DELAYS), (0.0, 1.06, ("wheels", SCALE))])
 def test_of_several_sensors_the_one_that_errs_is_named(late: float, fast: float, expected: tuple[str, str]) -> None:
     found = looked(Drive().window(late, fast, wheels=True)).found
-    assert found is not None
     assert found[:2] == expected
     assert abs(found[2] - (late or fast - 1)) < 3 * found[3]
 
@@ -105,12 +103,9 @@ def test_a_window_that_moves_on_is_fitted_from_where_the_last_fit_ended() -> Non
     assert first > 0
     made = Suspicions(SensorErrors(), DOWN, (0.02, 0.2))
     made.look(10**12, replace(window, steps=window.steps[: first + 40]))
-    assert made.found is not None
     made.look(2 * 10**12, window)
     found = made.found
     fresh = looked(window).found
-    assert found is not None
-    assert fresh is not None
     assert np.allclose(found[2:], fresh[2:], atol=2e-3)
 
 
@@ -155,7 +150,7 @@ def test_a_filter_that_is_sure_of_a_wrong_heading_begins_anew_where_the_motion_o
     start = State(drive.places[0], wrong @ [0.65, 0, 0], wrong, ZERO, ZERO, np.diag(sigmas**2))
     gyro = np.column_stack([0 * drive.t, 0 * drive.t, drive.turning])
     node = Node(0, (Hypothesis(0.0, start),), gyro[0], drive.forces[0], window=Window(begins=False))
-    fused = LateFilter(FilterConfig(gravity=9.81), node)
+    fused = ErrorStateFilter(FilterConfig(gravity=9.81), node)
     for k, x in enumerate(drive.t[1:], 1):
         fused.feel(Sample(round(x * 1e9), gyro[k], drive.forces[k], NOISE))
         if k % 10 == 0:
@@ -178,12 +173,12 @@ def test_a_filter_older_than_the_window_begins_anew_by_stronger_evidence(old: bo
     window = replace(Drive(seconds=26).window(), motion=None)
     node = Node(0, (Hypothesis(0.0, ones),), ZERO, -DOWN, window=window if old else Window())
     assert bool(node.window.first) == old
-    fused = LateFilter(FilterConfig(gravity=9.81), node)
+    fused = ErrorStateFilter(FilterConfig(gravity=9.81), node)
     for k in range(1, 5):
         fused.feel(Sample(k * 10**8, ZERO, -DOWN, NOISE))
     end = replace(ones, rotation=exp_rotation(np.array([0.0, 0.0, off])))
     fit = Fit(0, ones, np.zeros(0), until=4 * 10**8, end=end)
-    fused._suspicions = SimpleNamespace(look=lambda *_: fit, found=None)  # type: ignore[assignment]
+    fused._suspicions = SimpleNamespace(look=lambda *_: fit, found=None)
     fused.look()
     assert (fused.restarted == 4 * 10**8) == restarts
 
@@ -200,7 +195,7 @@ def test_a_window_that_slides_asks_for_five_standard_deviations(old: bool, sigma
         fits = {
             erring: Fit(0, ones, size, 200 - gain * erring, size * 0 + 0.07, 200, promise=gain) for erring in (0, 1)
         }
-        made._fitted = lambda window, erring: fits[erring]  # type: ignore[method-assign]
+        made._fitted = lambda window, erring: fits[erring]
         made.look(made._looked + 10**10, window)
 
     fitted(sigmas**2)

@@ -27,7 +27,7 @@ def begun_at_rest(seen: list[tuple[int, Model]]) -> bool:
             return found[1]
         for time, model in seen:
             if time == imu.stamp:
-                size = 6 if isinstance(model, FullPose) else int(np.isfinite(model.value).sum())  # type: ignore[union-attr]
+                size = 6 if isinstance(model, FullPose) else int(np.isfinite(model.value).sum())
                 sensor.saw(time, "other", model, np.eye(size) * VARIANCE)
     raise AssertionError("not begun")
 

@@ -136,7 +136,6 @@ def test_a_pose_is_that_of_the_corners_that_agree() -> None:
     pixels = seen(pose(3), POINTS) + RNG.normal(0, 0.3, (len(POINTS), 2))
     pixels[::4] += RNG.uniform(20, 60, (15, 2))
     found = solved(POINTS, pixels, K, 3.0, 20)
-    assert found is not None
     T, agree = found
     assert np.flatnonzero(~agree).tolist() == list(range(0, 60, 4))
     fit = refined(POINTS[agree], pixels[agree], T, K, 0.7, 3.0)
@@ -160,7 +159,6 @@ def referred(units: float) -> list[View]:
 @pytest.mark.parametrize("units", [0.2, 1.0, 3.0])
 def test_ways_between_keyframes_by_those_of_the_reference_are_the_scale(units: float) -> None:
     told = ratio(referred(units))
-    assert told is not None
     assert told[0] == pytest.approx(units)
     assert told[1] == pytest.approx(2 * float(np.linalg.norm(pose(1)[:3, 3])), rel=1e-3)
     factor, scale = Scale().corrected(referred(units), 0.02)
@@ -186,3 +184,5 @@ def test_a_known_scale_yields_in_part_and_never_by_much_at_once() -> None:
     assert Scale(0.1).weighed(50.0, 1e-6, 0.0)[0] == pytest.approx(1.3, rel=1e-3)
     assert Scale(0.1).weighed(1.0, 0.1, 0.0)[1].sigma == pytest.approx(0.1 / np.sqrt(2))
     assert Scale(0.1).weighed(1.0, 0.1, 0.09)[1].sigma == pytest.approx(0.09)
+    assert Scale(0.01).weighed(1.02, 0.02, 0.02)[1].sigma <= 0.01
+    assert Scale().weighed(3.0, 0.05, 0.02) == (3.0, Scale(0.05))

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from made_walls import RATE, SIZE, K, aside, rendered
+from operator_runs import assert_one_calibration, assert_resumes_alike, texts
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image, Odometry, Transforms
 from dataflow.operator import Context
 from dataflow.testing import Played, play
@@ -42,14 +42,10 @@ def run(given: dict[str, list[Any]], **params: Any) -> Played:
     return play(MonoVisualOdometry(**params), given, static=STATIC)
 
 
-def words(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
-
-
-def test_an_unknown_scale_is_said_in_the_message_itself() -> None:
+def test_message_of_an_unknown_scale_has_infinite_variance_and_its_own_frame() -> None:
     played = run(streams(16))
     poses: list[Any] = list(played["odometry"])
-    said = words(played)
+    said = texts(played)
     assert len(said) == 16
     assert len(poses) == sum(not text.startswith("initialising") for text in said)
     for pose in poses:
@@ -71,7 +67,7 @@ def test_wheels_give_metres_and_a_covariance() -> None:
     way = np.linalg.norm(poses[-1].position - poses[0].position)
     true = np.linalg.norm((truth[poses[-1].stamp] - truth[poses[0].stamp])[:3, 3])
     assert way == pytest.approx(float(true), rel=0.03)
-    assert "scale known to" in words(played)[-1]
+    assert "scale known to" in texts(played)[-1]
 
 
 def test_an_odometry_of_another_stamp_is_carried_to_the_image_by_its_velocity() -> None:
@@ -115,26 +111,16 @@ def test_fusion_takes_no_metres_from_poses_without_scale() -> None:
         fusion.process({"ns/mono/odometry": pose}, Context(pose.stamp))
     figures = fusion.summary()
     assert figures["ignored, mono/odometry: scale unknown"] == len(poses) - 1
-    assert figures["mono/odometry angular, used"] > 0  # type: ignore[operator]
+    assert figures["mono/odometry angular, used"] > 0
     assert "mono/odometry linear, used" not in figures
 
 
 @pytest.mark.long
-def test_a_restored_operator_goes_on_with_the_same_bytes() -> None:
+def test_restored_operator_resumes_alike() -> None:
     given = streams(20, wheels=True)
     info, extrinsics = given["image_info"][0], given["extrinsics"][0]
-    whole, first, second = MonoVisualOdometry(), MonoVisualOdometry(), MonoVisualOdometry()
-    for operator in (whole, first, second):
-        operator.setup()
-    for k in range(12):
-        whole.process(given["image"][k], info, given["scale"][k], extrinsics)
-        first.process(given["image"][k], info, given["scale"][k], extrinsics)
-    second.restore(unpack_state(pack_state(first.snapshot())))
-    for k in range(12, 20):
-        wanted = whole.process(given["image"][k], info, given["scale"][k], extrinsics)
-        got = second.process(given["image"][k], info, given["scale"][k], extrinsics)
-        assert got["odometry"].digest() == wanted["odometry"].digest()
-    assert second.summary() == whole.summary()
+    firings = [(image, info, scale, extrinsics) for image, scale in zip(given["image"], given["scale"], strict=True)]
+    assert_resumes_alike(MonoVisualOdometry, firings, 12)
 
 
 def test_a_reset_clock_begins_a_new_path() -> None:
@@ -150,15 +136,7 @@ def test_a_reset_clock_begins_a_new_path() -> None:
 
 
 @pytest.mark.long
-def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
+def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
     given = streams(16)
-    known = given["image_info"][0]
-    each = given | {"image_info": [known.replace(stamp=image.stamp) for image in given["image"]]}
-    assert play(MonoVisualOdometry(), each).digests() == run(given).digests()
-    each["image_info"][9] = known.replace(stamp=given["image"][9].stamp, K=np.diag([1.1, 1.1, 1.0]) @ known.K)
-    with pytest.raises(Exception, match="the calibration changed"):
-        play(MonoVisualOdometry(), each)
-
-
-def test_the_same_images_give_the_same_bytes() -> None:
-    assert run(streams(12)).digests() == run(streams(12)).digests()
+    other = given["image_info"][0].replace(K=np.diag([1.1, 1.1, 1.0]) @ given["image_info"][0].K)
+    assert_one_calibration(MonoVisualOdometry, given, ["image_info"], "image", other, 9)

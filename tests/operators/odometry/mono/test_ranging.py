@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from made_walls import RATE, SIZE, K, aside, depth_from, rendered
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike, texts
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image, Transforms
 from dataflow.messages.geometry import transform_points
 from dataflow.testing import Played, play
@@ -18,15 +18,7 @@ from operators.evaluation.trajectory import align
 from operators.geometry import se3
 from operators.geometry.pinhole import unproject
 from operators.odometry import MonoVisualOdometry
-from operators.odometry.mono.ranging import (
-    PERSISTENT,
-    MetricDepth,
-    Ranged,
-    RangingMemory,
-    RangingUse,
-    pose_at,
-    ranged,
-)
+from operators.odometry.mono.ranging import PERSISTENT, MetricDepth, Ranged, RangingMemory, RangingUse, pose_at, ranged
 from operators.odometry.mono.scale import Scale
 from operators.odometry.mono.settings import RangingConfig
 from operators.odometry.motion import Motion
@@ -89,10 +81,6 @@ def scale_of(played: Played, last: int) -> float:
     return float(align(estimate[-last:], truth[-last:], scaled=True)[2])
 
 
-def said(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]  # type: ignore[attr-defined]
-
-
 @pytest.mark.long
 def test_a_depth_image_now_and_then_gives_metres() -> None:
     played = run(streams({k: measured(k) for k in range(0, COUNT, 8)}))
@@ -112,12 +100,12 @@ def test_the_position_at_which_metres_are_found_counts_from_where_the_map_began(
     found = 30
     played = run(streams({found: measured(found)}))
     estimate, _, poses = in_metres(played)
-    unscaled = [p for p in played["odometry"] if p.frame == "odom_unscaled"]  # type: ignore[attr-defined]
+    unscaled = [p for p in played["odometry"] if p.frame == "odom_unscaled"]
     way = aside(COUNT)
     assert poses[0].stamp == stamp(found)
     assert unscaled
     assert np.linalg.norm(estimate[0]) == pytest.approx(float(np.linalg.norm(way[found][:3, 3])), rel=0.02)
-    assert "gives the scale" in said(played)[found]
+    assert "gives the scale" in texts(played)[found]
 
 
 @pytest.mark.parametrize(
@@ -165,7 +153,7 @@ def test_depth_that_shows_nothing_is_counted_and_changes_no_pose(make: Any, use:
     alone = run(streams({}))
     played = run(streams({k: make(k) for k in range(20, COUNT, 2)}), operator)
     assert [p.digest() for p in played["odometry"]] == [p.digest() for p in alone["odometry"]]
-    words = said(played)
+    words = texts(played)
     assert all("scale unknown, depth " in words[k] for k in range(20, COUNT, 2))
     assert operator.summary()[f"depth {use}"] == 10
 
@@ -176,7 +164,7 @@ def test_a_depth_image_that_comes_again_counts_once() -> None:
     alone, again = run(streams({20: once})), run(streams(dict.fromkeys(range(20, 30), once)), operator)
     assert [p.digest() for p in again["odometry"]] == [p.digest() for p in alone["odometry"]]
     assert operator.summary()[f"depth {RangingUse.FLAWED}"] == 9
-    assert "depth repeats the last one" in said(again)[21]
+    assert "depth repeats the last one" in texts(again)[21]
 
 
 @pytest.mark.long
@@ -186,14 +174,14 @@ def test_depth_that_contradicts_a_known_scale_is_left_out() -> None:
     operator = MonoVisualOdometry()
     kept, both = run(streams(good)), run(streams(good | wrong), operator)
     assert [p.digest() for p in both["odometry"]] == [p.digest() for p in kept["odometry"]]
-    assert "contradicts the scale (1.4" in said(both)[25]
+    assert "contradicts the scale (1.4" in texts(both)[25]
     assert operator.summary()[f"depth {RangingUse.CONTRARY}"] == PERSISTENT - 1
 
 
 def test_a_scale_that_was_wrong_is_found_anew_without_a_jump_and_the_way_so_far_is_doubted() -> None:
     wrong = {k: (1.5 * measured(k)).astype(np.float32) for k in range(14, 20)}
     played = run(streams(wrong | {k: measured(k) for k in range(20, COUNT)}))
-    words, (estimate, _, poses) = said(played), in_metres(played)
+    words, (estimate, _, poses) = texts(played), in_metres(played)
     turned = [k for k, text in enumerate(words) if "gives another scale" in text]
     assert turned == [20 + PERSISTENT - 1]
     steps = np.linalg.norm(np.diff(estimate, axis=0), axis=1)
@@ -219,33 +207,12 @@ def test_depth_without_a_calibration_is_refused() -> None:
         operator.process(given["image"][0], given["image_info"][0], depth=given["depth"][0])
 
 
-def test_a_restored_operator_goes_on_with_the_same_bytes() -> None:
+def test_restored_operator_resumes_alike() -> None:
     given = streams({k: measured(k) for k in range(0, COUNT, 3)})
     depths = {d.stamp: d for d in given["depth"]}
-    calibrations = given["image_info"][0], None, None
-
-    def step(operator: MonoVisualOdometry, k: int) -> Any:
-        return operator.process(given["image"][k], *calibrations, depths.get(stamp(k)), given["depth_info"][0])
-
-    whole, first, second = MonoVisualOdometry(), MonoVisualOdometry(), MonoVisualOdometry()
-    for operator in (whole, first, second):
-        operator.setup()
-    for k in range(22):
-        step(whole, k)
-        step(first, k)
-    second.restore(unpack_state(pack_state(first.snapshot())))
-    for k in range(22, 32):
-        wanted, got = step(whole, k), step(second, k)
-        assert got["odometry"].digest() == wanted["odometry"].digest()
-        assert got["status"].digest() == wanted["status"].digest()
-    assert second.summary() == whole.summary()
-
-
-def test_two_sources_of_metres_make_a_scale_no_less_sure() -> None:
-    factor, better = Scale(0.01).weighed(1.02, 0.02, 0.02)
-    assert 1.0 < factor < 1.02
-    assert better.sigma <= 0.01
-    assert Scale().weighed(3.0, 0.05, 0.02) == (3.0, Scale(0.05))
+    info, depth_info = given["image_info"][0], given["depth_info"][0]
+    firings = [(image, info, None, None, depths.get(image.stamp), depth_info) for image in given["image"][:32]]
+    assert_resumes_alike(MonoVisualOdometry, firings, 22)
 
 
 # -- one depth image ---------------------------------------------------------------------------------------------------
@@ -318,7 +285,6 @@ def test_depth_is_of_the_pose_at_its_stamp_if_that_was_measured() -> None:
     result = TrackResult(80, after, np.eye(6), np.zeros(6), Status.TRACKING, "", 9, 0.0, False)
     np.testing.assert_array_equal(pose_at(80, result, None), after)
     way = pose_at(20, result, before)
-    assert way is not None
     np.testing.assert_allclose(way[:3, 3], after[:3, 3] / 4, atol=2e-3)
     for stamp, last in ((90, before), (0, before), (20, None), (20, replace(before, blind_s=0.1))):
         assert pose_at(stamp, result, last) is None

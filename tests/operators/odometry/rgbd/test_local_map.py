@@ -85,7 +85,7 @@ def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanw
     assert [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0)] == [0]
 
 
-def test_what_moves_is_not_told_by_a_keyframe_that_the_odometry_has_drifted_from() -> None:
+def test_keyframes_beyond_the_drift_do_not_detect_movers() -> None:
     """Laid on one that is off, what stands still would seem to stand before it."""
     known = LocalMap(20)
     known.add(replace(keyframe(0), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
@@ -164,7 +164,7 @@ def test_surfaces_are_compared_with_keyframes_that_have_one() -> None:
     assert [k.stamp for k in known.references(keyframe(5).T_world_camera, 2, 0)] == [4, 3]
 
 
-def test_what_has_moved_is_told_by_the_oldest_of_the_last_keyframes_that_shares_the_view() -> None:
+def test_movers_are_detected_by_the_oldest_recent_keyframe_that_shares_the_view() -> None:
     known = of_segments(*[0] * 10)
     assert [k.stamp for k in known.earlier(keyframe(9).T_world_camera, 0)] == [6]
     assert [k.stamp for k in known.earlier(keyframe(6).T_world_camera, 0)] == [4]

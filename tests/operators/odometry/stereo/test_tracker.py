@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike, largest_errors
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
-from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, Sightings, adjust
 from operators.odometry.stereo.odometry import rig_of
 from operators.odometry.stereo.relocalizer import FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -32,12 +32,6 @@ def follow(pairs: list[Pair]) -> list[TrackResult]:
     return [odometry.track(left, right, i * 100_000_000) for i, (left, right) in enumerate(pairs)]
 
 
-def errors(results: list[TrackResult], poses: list[Matrix]) -> tuple[float, float]:
-    """Largest error of position (m) and rotation (rad), no alignment."""
-    x = np.array([se3.log(invert(T) @ r.T_world_camera) for r, T in zip(results, poses, strict=True)])
-    return float(np.linalg.norm(x[:, :3], axis=1).max()), float(np.linalg.norm(x[:, 3:], axis=1).max())
-
-
 # -- accuracy ------------------------------------------------------------------------------------------------
 
 
@@ -45,7 +39,7 @@ def test_pose_follows_known_motion() -> None:
     pairs, poses = sequence(25)
     results = follow(pairs)
     assert {r.status for r in results} == {Status.TRACKING}
-    position, rotation = errors(results, poses)
+    position, rotation = largest_errors(results, poses)
     assert position < 0.05  # of ten metres
     assert rotation < 0.005
 
@@ -63,7 +57,7 @@ def test_disparities_that_are_off_by_a_constant_do_not_stretch_the_way(shift: fl
     late = np.linalg.norm(results[-1].T_world_camera[:3, 3] - results[12].T_world_camera[:3, 3])
     truth = np.linalg.norm(poses[-1][:3, 3] - poses[12][:3, 3])
     assert late == pytest.approx(truth, rel=0.01)
-    assert errors(results, poses)[0] < 0.05  # of ten metres: the first windows show the offset
+    assert largest_errors(results, poses)[0] < 0.05  # of ten metres: the first windows show the offset
 
 
 def test_points_at_infinity_give_no_corner_whatever_the_offset() -> None:
@@ -75,7 +69,7 @@ def test_points_at_infinity_give_no_corner_whatever_the_offset() -> None:
 
 
 def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() -> None:
-    """Poses and points are 2 % too far, as of an offset of 0.4 px that nobody knew of when they were measured."""
+    """Poses and points are 2 % too far, as by an offset of 0.4 px unknown when they were measured."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(8, 40, 60)])
     poses = np.array(driving(8))
@@ -229,13 +223,13 @@ def test_black_and_frozen_images_are_noticed_and_bridged() -> None:
     assert [r.status for r in results[10:12]] == [Status.PREDICTED] * 2
     assert results[10].reason == "left image is black"
     assert results[12].status is Status.TRACKING
-    assert errors(results[12:], poses[12:])[0] < 0.1
+    assert largest_errors(results[12:], poses[12:])[0] < 0.1
     frozen = follow([*pairs[:10], pairs[9]])
     assert frozen[10].reason == "left image repeats the last one; right image repeats the last one"
 
 
 @pytest.mark.long
-def test_long_darkness_is_a_loss_that_the_covariance_tells_of() -> None:
+def test_long_darkness_is_a_loss_with_a_large_covariance() -> None:
     pairs, poses = sequence(25)
     dark = (np.zeros_like(pairs[0][0]),) * 2
     results = follow([dark if 5 <= i < 15 else pair for i, pair in enumerate(pairs)])
@@ -277,7 +271,7 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
 
     assert (back.status, back.reason) == (Status.RELOCALISED, "the map found again by 999 features")
     assert (after.status, odometry.state.map.apart_since) == (Status.TRACKING, None)
-    assert errors([back, after], poses[17:19])[0] < 0.1
+    assert largest_errors([back, after], poses[17:19])[0] < 0.1
     assert np.sqrt(np.trace(after.covariance[:3, :3])) < 0.2 < np.sqrt(np.trace(apart[0].covariance[:3, :3]))
     kept = odometry.state.map.keyframes
     assert {k.segment for k in kept} == {0}
@@ -326,10 +320,6 @@ def test_wrong_input_is_refused(left: Gray, right: Gray, stamp: int, message: st
 
 
 def test_wrong_calibration_is_refused() -> None:
-    with pytest.raises(ValueError, match="baseline"):
-        StereoRig(K, 0.0)
-    with pytest.raises(ValueError, match="fixed"):
-        StereoOdometryConfig(window=2, fixed=2)
     left, right = infos()
     with pytest.raises(ValueError, match="P"):
         rig_of(left, left.replace(P=None))
@@ -347,26 +337,13 @@ def infos() -> tuple[CameraInfo, CameraInfo]:
 
 
 @pytest.mark.long
-def test_operator_goes_on_alike_from_a_recorded_state() -> None:
+def test_restored_operator_resumes_alike() -> None:
     pairs, _ = sequence(25)
-
-    def given(i: int) -> tuple[Image, Image, CameraInfo, CameraInfo]:
-        left, right = (
-            Image(stamp=i * 100_000_000, frame=f, data=d) for f, d in zip(("left", "right"), pairs[i], strict=True)
-        )
-        return left, right, *infos()
-
-    one, other = StereoVisualOdometry(), StereoVisualOdometry()
-    one.setup()
-    other.setup()
-    for i in range(10):
-        sent = one.process(*given(i))
-    assert (sent["odometry"].child_frame, sent["status"].names) == ("left", ("visual_odometry",))
-    other.restore(unpack_state(pack_state(one.snapshot())))
-    for i in range(10, 15):
-        a, b = one.process(*given(i)), other.process(*given(i))
-        assert {port: m.digest() for port, m in a.items()} == {port: m.digest() for port, m in b.items()}
-    assert one.summary() == other.summary() == {"tracking": 15}
+    firings = [
+        (*(Image(stamp=i * 100_000_000, frame=f, data=d) for f, d in (("left", left), ("right", right))), *infos())
+        for i, (left, right) in enumerate(pairs[:15])
+    ]
+    assert assert_resumes_alike(StereoVisualOdometry, firings, 10).summary() == {"tracking": 15}
 
 
 # -- recorded data -------------------------------------------------------------------------------------------
@@ -381,9 +358,9 @@ def test_recorded_drive_is_followed_within_one_percent(data_dir: Path) -> None:
     source = KittiOdometry(path=str(folder), stop=21)
     source.setup()
     statics = source.static_outputs()
-    odometry = StereoOdometry(rig_of(statics["left_info"], statics["right_info"]))  # type: ignore[arg-type]
+    odometry = StereoOdometry(rig_of(statics["left_info"], statics["right_info"]))
     for step in source.stream():
-        result = odometry.track(step["left"].data, step["right"].data, step["left"].stamp)  # type: ignore[attr-defined]
+        result = odometry.track(step["left"].data, step["right"].data, step["left"].stamp)
         assert result.status is Status.TRACKING
-        way = step["ground_truth"].matrix()[:3, 3]  # type: ignore[attr-defined]
+        way = step["ground_truth"].matrix()[:3, 3]
     assert np.linalg.norm(result.T_world_camera[:3, 3]) == pytest.approx(np.linalg.norm(way), rel=0.02)

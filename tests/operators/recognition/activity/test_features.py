@@ -17,7 +17,7 @@ def person(x: float) -> Body:
 
 
 @pytest.mark.parametrize(("roles", "speed"), [({"agent"}, 0.0), ({"agent"}, 0.9), ({"agent", "person"}, 0.9)])
-def test_a_robot_that_is_new_is_as_fast_as_its_velocity_tells(roles: set[str], speed: float) -> None:
+def test_speed_of_a_new_robot_is_its_velocity(roles: set[str], speed: float) -> None:
     window, around = AgentWindow(), Surroundings()
     body = replace(person(2.0), roles=frozenset(roles), velocity=np.array([0.0, speed, 0.3]))
     window.add(4.0, body)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_graphs import scene_graph
 
 from dataflow.messages import Pose, SceneGraph
 from operators.recognition.activity.features import COUNT
@@ -22,18 +23,9 @@ CLASSES = ("walking", "standing")
 
 def graph(k: int, people: dict[int, float], chair: bool = False, *, rate: int = 4) -> SceneGraph:
     """The `k`-th of graphs that come so often a second: people by id and where along x they are."""
-    ids = [*people, *([99] if chair else [])]
-    return SceneGraph(
-        stamp=k * 1_000_000_000 // rate,
-        frame="map",
-        class_names=("person", "chair"),
-        ids=ids,
-        class_ids=[0] * len(people) + [1] * chair,
-        positions=np.array([[x, 0, 0.8] for x in people.values()] + [[5.0, 0, 0.4]] * chair).reshape(-1, 3),
-        sizes=np.tile([0.5, 0.5, 1.6], (len(ids), 1)),
-        subjects=np.zeros(0, np.int32),
-        objects=np.zeros(0, np.int32),
-    )
+    things = [(id, "person", (x, 0, 0.8), (0.5, 0.5, 1.6)) for id, x in people.items()]
+    things += [(99, "chair", (5.0, 0, 0.4), (0.5, 0.5, 1.6))] if chair else []
+    return scene_graph(things, stamp=k * 1_000_000_000 // rate, frame="map")
 
 
 def robot(k: int) -> Pose:

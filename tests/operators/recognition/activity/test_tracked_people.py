@@ -48,7 +48,7 @@ def test_a_seed_decides_what_a_tracker_makes_of_it() -> None:
     assert [t.features.tobytes() for t in first] != [t.features.tobytes() for t in other]
 
 
-def test_who_walks_out_of_the_image_stays_where_it_was_for_six_seconds() -> None:
+def test_person_outside_the_image_is_kept_in_place_for_six_seconds() -> None:
     made = episode(20.0)
     behind = made.camera.copy()
     behind[40:, :3, :3] = behind[40:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])  # it looks the other way from 5 s on

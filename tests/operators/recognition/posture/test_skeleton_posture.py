@@ -33,16 +33,9 @@ def seen(body: dict[str, tuple[float, float]], facing: float, pitch: float, roll
 def message(*people: NDArray[np.float32], scores: float = 0.9) -> Keypoints2D:
     points = np.stack(people)
     return Keypoints2D(
-        stamp=5,
-        frame="camera",
-        width=640,
-        height=480,
-        names=COCO_KEYPOINTS,
-        links=np.array(COCO_LINKS, np.int32),
-        points=points,
-        scores=np.full(points.shape[:2], scores, np.float32),
-        ids=np.arange(len(points)) + 30,
-    )
+        stamp=5, frame="camera", width=640, height=480, names=COCO_KEYPOINTS, links=np.array(COCO_LINKS, np.int32),
+        points=points, scores=np.full(points.shape[:2], scores, np.float32), ids=np.arange(len(points)) + 30,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("pitch", [0.0, 15.0])
@@ -52,7 +45,6 @@ def test_people_stand_or_sit_from_all_around(pitch: float, roll: float) -> None:
     for body, said in ((UPRIGHT, "standing"), (SEATED, "sitting")):
         found = SkeletonPosture().process(message(*(seen(body, way, pitch, roll) for way in ways)))
         assert found.labels() == (said,) * len(ways)
-        assert found.ids is not None
         assert found.ids.tolist() == [30 + k for k in range(len(ways))]
         assert found.scores.min() > 0.6
 
@@ -62,7 +54,6 @@ def test_hidden_or_unsure_joints_tell_nothing() -> None:
     legless = seen({part: UPRIGHT[part] for part in ("shoulder", "hip")}, 20, 0, 0)
     operator = SkeletonPosture()
     found = operator.process(message(legless, whole))
-    assert found.ids is not None
     assert found.ids.tolist() == [31]
     assert not operator.process(message(whole, scores=0.3)).labels()
     assert operator.process(message(whole).replace(ids=None)).ids is None

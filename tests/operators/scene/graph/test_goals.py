@@ -9,7 +9,7 @@ import pytest
 
 from operators.labels import LabelSpace, labels_file
 from operators.scene.bodies import Body
-from operators.scene.graph.goals import GoalInference
+from operators.scene.graph.agents import GoalInference
 from operators.scene.graph.layers import GraphSettings, LayeredGraph
 
 STEP = 250_000_000
@@ -25,15 +25,10 @@ def person(x: float, y: float) -> Body:
 
 
 def after(places: list[tuple[float, float]], goals: list[Body]) -> dict[int, float]:
-    inference, found = inferring(), {-1: 1.0}
+    inference, found = GoalInference(), {-1: 1.0}
     for k, (x, y) in enumerate(places):
         found = inference.update(0.25 * k, person(x, y), goals)
     return found
-
-
-def inferring() -> GoalInference:
-    s = GraphSettings()
-    return GoalInference(s.trust, s.memory, s.elsewhere)
 
 
 def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
@@ -46,8 +41,8 @@ def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
 
 
 @pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
-def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
-    """Somebody walks straight past one mug to another, which lies on this side of a table or on that."""
+def test_goal_of_a_path_is_symmetric_in_left_and_right(side: int) -> None:
+    """A person walks straight past one mug to another, which lies on this side of a table or on that."""
     mugs = [thing(2, "mug", 0.6, 0.3 * side), thing(3, "mug", 0.6, -0.3 * side)]
     found = after([(0.08 * k, 0.03 * side * k) for k in range(9)], mugs)
     assert max(found, key=lambda i: found[i]) == 2
@@ -56,7 +51,7 @@ def test_a_path_to_a_thing_says_the_same_for_either_hand(side: int) -> None:
 def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
     """Doors left and right, equally far from who has come from the left: that to the left was left behind."""
     left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
-    inference, walk = inferring(), [0.2 * k for k in range(6)]
+    inference, walk = GoalInference(), [0.2 * k for k in range(6)]
     for k, x in enumerate(walk):
         late = inference.update(0.25 * k, person(x, 0.0), [right] if k < 5 else [left, right])
     early = after([(x, 0.0) for x in walk], [left, right])
@@ -64,7 +59,7 @@ def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
     assert late[1] < 0.5 * late[2]
 
 
-def test_the_jitter_of_a_box_that_stands_still_says_nothing_against_any_goal() -> None:
+def test_jitter_of_a_still_box_leaves_goals_as_they_are() -> None:
     rng = np.random.default_rng(3)
     chair = [thing(1, "chair", 0.44, 0.0, size=0.5, z=0.4)]
     still = after([(0.0, 0.0)] * 40, chair)
@@ -86,12 +81,3 @@ def test_a_person_heads_for_what_it_walks_to_where_the_label_space_has_goals(
         now = graph.update(k * STEP, [table, other, person(min(-1 + 0.15 * k, 0.3), 0.0)], None)
     (act,) = now.acts
     assert act.goal == goal
-
-
-def test_a_restored_inference_goes_on_the_same() -> None:
-    goals = [thing(1, "door", 4, 0, size=1), thing(2, "chair", 0, 4, size=0.5)]
-    first, second = inferring(), inferring()
-    for k in range(8):
-        first.update(0.25 * k, person(0.2 * k, 0.1 * k), goals)
-    second.restore(first.snapshot())
-    assert first.update(2.0, person(1.7, 0.8), goals) == second.update(2.0, person(1.7, 0.8), goals)

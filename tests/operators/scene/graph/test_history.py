@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_graphs import scene_graph
 from typer.testing import CliRunner
 
 from dataflow.messages import Activity, SceneGraph
@@ -16,38 +17,23 @@ from operators.scene.commands import scene
 from operators.scene.graph.history import history
 from operators.scene.graph.query import QueryError
 
-NAMES = ("mug", "table", "person", "floor")
-IDS = {"mug 2": 0, "table 1": 1, "person 4": 2, "floor": 3}
+IDS = {"mug 2": 2, "table 1": 1, "person 4": 4, "floor": 0}
 SECOND = 1_000_000_000
 
 
 def graph(second: int, mug: Sequence[float] | None, *relations: tuple[str, str, str, float]) -> SceneGraph:
     """A table and a person, a mug where there is one, and relations between them by name."""
     here = [name for name in IDS if name != "mug 2" or mug is not None]
-    return SceneGraph(
-        stamp=second * SECOND,
-        frame="world",
-        class_names=NAMES,
-        labels=tuple(here),
-        ids=np.array([{"mug 2": 2, "table 1": 1, "person 4": 4, "floor": 0}[n] for n in here], np.int64),
-        class_ids=np.array([IDS[n] for n in here], np.int32),
-        positions=np.array([mug if n == "mug 2" and mug is not None else (0.0, 0.0, 0.0) for n in here], float),
-        sizes=np.ones((len(here), 3)),
-        predicates=tuple(p for _, p, _, _ in relations),
-        subjects=np.array([here.index(s) for s, _, _, _ in relations], np.int32),
-        objects=np.array([here.index(o) for _, _, o, _ in relations], np.int32),
-        relation_scores=np.array([score for _, _, _, score in relations], np.float32),
-    )
+    things = [(IDS[n], n.split()[0], mug if n == "mug 2" and mug else (0.0, 0.0, 0.0), (1, 1, 1)) for n in here]
+    rows = [(IDS[s], p, IDS[o], score) for s, p, o, score in relations]
+    return scene_graph(things, rows, stamp=second * SECOND, labels=tuple(here))
 
 
 def act(second: int, activity: str) -> Activity:
     return Activity(
-        stamp=second * SECOND,
-        class_names=("walking", "drinking"),
-        subjects=np.array([4], np.int64),
-        class_ids=np.array([("walking", "drinking").index(activity)], np.int32),
-        scores=np.array([0.9], np.float32),
-    )
+        stamp=second * SECOND, class_names=("walking", "drinking"), subjects=np.array([4], np.int64),
+        class_ids=np.array([("walking", "drinking").index(activity)], np.int32), scores=np.array([0.9], np.float32),
+    )  # fmt: skip
 
 
 GRAPHS = [
@@ -92,7 +78,7 @@ def test_a_node_that_is_nowhere_is_named_with_the_nearest() -> None:
         told("mug 3")
 
 
-def test_the_command_tells_it_up_to_a_time(tmp_path: Path) -> None:
+def test_command_shows_history_up_to_a_time(tmp_path: Path) -> None:
     file = tmp_path / "room.mcap"
     with RecordingWriter(file, metadata={}) as writer:
         writer.add_stream("robot1/scene/graph", SceneGraph)

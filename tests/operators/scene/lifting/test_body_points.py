@@ -24,7 +24,6 @@ def body(parts: Sequence[NDArray[np.float64]], lowest: float, highest: float) ->
     groups = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
     inner = (points[:, 2] >= lowest) & (points[:, 2] <= highest)
     found = body_of(points, inner, groups, UP)
-    assert found is not None
     return points[found[0]], found[1]
 
 
@@ -39,7 +38,7 @@ def test_legs_below_a_chair_that_hides_the_middle_are_of_the_body() -> None:
     assert points[:, 2].min() < 0.2
 
 
-def test_somebody_farther_away_in_the_same_box_is_another() -> None:
+def test_person_farther_away_in_the_same_box_is_another() -> None:
     points, share = body([column(0, 0.2, 1.6), column(1.5, 0.9, 1.6)], 0.0, 1.7)
     assert points[:, 0].max() == 0
     assert 0.6 < share < 0.7

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.labels import LabelSpace, labels_file
-from operators.scene.box_overlap import shared_volume, upright_iou
-from operators.scene.map.box_images import image_boxes, images
-from operators.scene.map.cells import standing_box
-from operators.scene.map.cuboid import Box, ImageView, _surface, fit_cuboid
+from operators.scene.bodies import shared_volume, upright_iou
+from operators.scene.map.cuboid import Box, ImageView, _surface, fit_cuboid, image_boxes, images
+from operators.scene.map.voxels import standing_box
 
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
 ALL = np.ones(4, np.bool_)
@@ -124,7 +123,7 @@ def test_where_a_sharp_camera_looks_an_edge_strays_by_more_pixels() -> None:
     assert by_fine < 2.0 * coarse
 
 
-def test_a_fit_tells_which_view_is_of_another_thing() -> None:
+def test_fit_reveals_the_view_of_another_thing() -> None:
     beside: Box = (BOOK[0] + [0, 0.07, 0], BOOK[1], BOOK[2])
     views = [view_of(beside if k == 2 else BOOK, y, 0.5) for k, y in enumerate(SIDEWAYS)]
     points = spine(BOOK)

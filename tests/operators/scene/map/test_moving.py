@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from dataflow.execution.snapshots import pack_state, unpack_state
-from operators.scene.map.cells import Cells
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.moving import RecentPlaces
 from operators.scene.map.range_view import RangeView
+from operators.scene.map.voxels import VoxelSet
 
 Array = NDArray[np.float64]
 Block = tuple[Sequence[float], Sequence[float]]
@@ -52,10 +52,10 @@ def judged(
         eye = np.array([speed * k / 10, 0.0, 1.7])
         points, of = scanned([house, place(k / 10)], eye)
         view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
-        cells = Cells.of(points[(of == 1) & (points[:, 0] > eye[0] + ahead)], SIDE)
+        voxels = VoxelSet.of(points[(of == 1) & (points[:, 0] > eye[0] + ahead)], SIDE)
         if vehicle is None:
-            vehicle = MapObject(7, cells, np.array([1.0]), 1.0, 0, 0)
-        vehicle.cells, vehicle.center = cells, cells.middle
+            vehicle = MapObject(7, voxels, np.array([1.0]), 1.0, 0, 0)
+        vehicle.voxels, vehicle.center = voxels, voxels.middle
         recent.judge(k * TENTH, [vehicle], view)
         if k == again:
             kept, recent = recent.snapshot(), RecentPlaces(0.1)
@@ -88,10 +88,10 @@ def test_a_truck_that_overtakes_drives_though_its_side_looks_alike_and_its_rear_
     assert judged(lambda t: place(0), 2.0, 2).moving < 0.4
 
 
-def test_nothing_tells_of_the_first_view_and_a_restored_memory_goes_on_the_same() -> None:
+def test_motion_is_open_at_the_first_view_and_a_restored_memory_goes_on() -> None:
     eye = np.array([0.0, 0.0, 1.7])
     points, of = scanned([HOUSE, beside(8)], eye)
-    vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
+    vehicle = MapObject(7, VoxelSet.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
     assert np.isnan(vehicle.moving)
     RecentPlaces(0.1).judge(0, [vehicle], RangeView(points - eye, np.eye(4), 0.012))
     assert vehicle.moving == 0.5
@@ -101,29 +101,30 @@ def test_nothing_tells_of_the_first_view_and_a_restored_memory_goes_on_the_same(
 def test_voxels_that_are_added_later_are_of_no_moment_before() -> None:
     eye = np.array([0.0, 0.0, 1.7])
     points, of = scanned([HOUSE, beside(8)], eye)
-    vehicle = MapObject(7, Cells.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
+    vehicle = MapObject(7, VoxelSet.of(points[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0)
     recent = RecentPlaces(0.1)
     view = RangeView(points - eye, np.block([[np.eye(3), eye[:, None]], [np.zeros(3), 1.0]]), 0.012)
     recent.judge(0, [vehicle], view)
     restored = RecentPlaces(0.1)
     restored.restore(unpack_state(pack_state(recent.snapshot())))
-    vehicle.cells.add(Cells.of(points[of == 1] - [0, 6, 0], SIDE))
-    vehicle.cells = Cells.of(points[of == 1], SIDE)
+    vehicle.voxels.add(VoxelSet.of(points[of == 1] - [0, 6, 0], SIDE))
+    vehicle.voxels = VoxelSet.of(points[of == 1], SIDE)
     again = replace(vehicle)
     recent.judge(6 * TENTH, [vehicle], view)
     restored.judge(6 * TENTH, [again], view)
     assert vehicle.moving == again.moving
 
 
-def test_the_places_of_a_car_of_a_few_voxels_say_nothing_and_its_centre_counts() -> None:
+def test_motion_of_a_car_of_few_voxels_is_that_of_its_centre() -> None:
     far = ((200, 0, 10), (1, 400, 30))
     car = judged(lambda t: ((90 + 10 * t, 3, 1), (4.5, 1.8, 1.5)), 0, 0, house=far)
-    assert 0 < len(car.cells) < 5
+    assert 0 < len(car.voxels) < 5
     assert np.isnan(car.moving)
 
 
-def test_what_is_known_of_a_car_outlasts_a_view_that_says_nothing() -> None:
-    recent, car = RecentPlaces(0.1), MapObject(7, Cells.of(np.array([[8.0, 3, 1]]), SIDE), np.array([1.0]), 1.0, 0, 0)
+def test_knowledge_of_a_car_outlasts_an_empty_view() -> None:
+    recent, voxels = RecentPlaces(0.1), VoxelSet.of(np.array([[8.0, 3, 1]]), SIDE)
+    car = MapObject(7, voxels, np.array([1.0]), 1.0, 0, 0)
     empty = RangeView(np.zeros((0, 3)), np.eye(4), 0.012)
     recent.judge(0, [car], empty)
     car.moving = 0.04
@@ -137,7 +138,7 @@ def test_whether_a_car_that_was_hidden_moves_is_open() -> None:
     wall: Block = ((8, 2, 1.5), (0.5, 6, 3))
     before, _ = scanned([HOUSE, beside(20), wall], eye)
     now, of = scanned([HOUSE, beside(20)], eye)
-    car, other = (MapObject(i, Cells.of(now[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0) for i in (7, 8))
+    car, other = (MapObject(i, VoxelSet.of(now[of == 1], SIDE), np.array([1.0]), 1.0, 0, 0) for i in (7, 8))
     recent = RecentPlaces(0.1)
     recent.judge(0, [other], RangeView(before - eye, T, 0.012))
     recent.judge(6 * TENTH, [car], RangeView(now - eye, T, 0.012))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.labels import SizePrior
-from operators.scene.map.box_images import image_boxes
-from operators.scene.map.cuboid import ImageView
-from operators.scene.map.kinds import Kinds
+from operators.scene.map.class_priors import ClassPriors
+from operators.scene.map.cuboid import ImageView, image_boxes
 from operators.scene.map.map_object import MapObject
 from operators.scene.map.matching import MapSettings, Observation
 from operators.scene.map.merging import merge
@@ -23,7 +23,9 @@ from operators.scene.map.range_view import RangeView
 BOX, MUG, BALL = 0, 1, 2
 SECOND = 1_000_000_000
 BALL_SIZE = {BALL: (SizePrior((0.12, 0.12, 0.12), (0.4, 0.4, 0.4), True),)}
+PERSON = SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), foot=1.0)
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+WALL = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 112)), axis=-1).reshape(-1, 3)
 Solid = tuple[Sequence[float], Sequence[float]]
 """Centre and full size of a box along the axes."""
 
@@ -51,17 +53,16 @@ def observation(solid: Solid, class_id: int, T: NDArray[np.float64]) -> Observat
 
 def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] = ()) -> ObjectMap:
     """The map after views of things, each said to be of a class and perhaps a track, a quarter of a second apart."""
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
+    known = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
     for k, scene in enumerate(scenes):
         T = looking(0.4 * np.sin(k))
-        wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
-        hidden = np.zeros(len(wall), np.bool_)
-        way = wall - T[:3, 3]
+        hidden = np.zeros(len(WALL), np.bool_)
+        way = WALL - T[:3, 3]
         for solid, _ in scene:
             center, size = np.array(solid[0]), np.array(solid[1])
             at = T[:3, 3] + way * ((center[0] - T[0, 3]) / way[:, :1])
             hidden |= (np.abs(at - center)[:, 1:] < size[1:] / 2).all(axis=1)
-        points = np.concatenate([wall[~hidden], *(surface(solid) for solid, _ in scene)])
+        points = np.concatenate([WALL[~hidden], *(surface(solid) for solid, _ in scene)])
         seen = [observation(solid, class_id, T) for solid, class_id in scene]
         seen = [replace(each, track=track) for each, track in zip(seen, tracks or [-1] * len(seen), strict=True)]
         in_sensor = (points - T[:3, 3]) @ T[:3, :3]
@@ -70,11 +71,35 @@ def after(scenes: Sequence[Sequence[tuple[Solid, int]]], tracks: Sequence[int] =
 
 
 THING: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.12))
+BESIDE: Solid = ((2.0, 0.13, 0.1), THING[1])
+NOTHING = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
 
 
 def only(known: ObjectMap) -> MapObject:
     (object,) = known.confirmed()
     return object
+
+
+def mapping(sizes: Mapping[int, Sequence[SizePrior]] = {}, **roles: Sequence[int]) -> ObjectMap:
+    """An empty map of three classes with usual sizes, and `movers`, `carriers`, `portable` among them."""
+    return ObjectMap(3, ClassPriors(**{"movers": [], "usual": sizes} | roles), MapSettings())
+
+
+def watched(
+    known: ObjectMap, views: Iterable[tuple[NDArray[np.float64], Sequence[Observation]]], *, behind: bool = False
+) -> ObjectMap:
+    """The map after views, a quarter of a second apart, that show things and, where asked, a wall behind them."""
+    for T, seen in views:
+        points = np.concatenate([WALL, *(each.points for each in seen)]) if behind else np.zeros((0, 3))
+        stamp = SECOND // 4 + (known.snapshot()["stamp"] or 0)
+        known.update(stamp, seen, RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    return known
+
+
+def around(solid: Solid, class_id: int, count: int, score: float = 0.8) -> list[tuple[NDArray[np.float64], Any]]:
+    """Views of a thing from changing places."""
+    places = [looking(0.4 * np.sin(k)) for k in range(count)]
+    return [(T, [replace(observation(solid, class_id, T), score=score)]) for T in places]
 
 
 def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None:
@@ -84,39 +109,36 @@ def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None
     assert object.views == 12
 
 
-@pytest.mark.parametrize(("bottom", "reaches_down"), [(0.7, True), (1.6, False)])
-def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reaches_down: bool) -> None:
-    size = {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), foot=1.0),)}
-    known = ObjectMap(3, Kinds([BOX], size), MapSettings())
+@pytest.mark.parametrize(
+    ("prior", "bottom", "height", "reaches_down"),
+    [
+        (PERSON, 0.3, 0.8, True),  # whose feet are hidden
+        (PERSON, 1.2, 0.8, False),
+        (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=0.2), -0.28, 0.8, True),
+        (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3)), -0.28, 0.8, False),  # of a class that does not stand there
+    ],
+)
+def test_what_stands_on_the_floor_reaches_down_to_it(
+    prior: SizePrior, bottom: float, height: float, reaches_down: bool
+) -> None:
+    known = mapping({BOX: (prior,)}, movers=[BOX] if prior is PERSON else [])
     known.floor = -0.4
-    T = looking(0.0)
-    half: Solid = ((2.0, 0.0, bottom - 0.4 + 0.4), (0.5, 0.5, 0.8))
-    for k in range(4):
-        known.update((k + 1) * SECOND // 4, [observation(half, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+    watched(known, around(((2.5, 0.0, bottom + height / 2), (0.5, 0.5, height)), BOX, 6))
     center, box, _ = only(known).box
-    top = float(center[2] + box[2] / 2)
-    assert abs(top - (bottom + 0.4)) < 0.1
+    assert float(center[2] + box[2] / 2) == pytest.approx(bottom + height, abs=0.1)
     assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
 
 
 @pytest.mark.parametrize("along", [0.0, 0.4])
 def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: float) -> None:
-    known = ObjectMap(3, Kinds([BOX], {BOX: (SizePrior((0.5, 0.59, 1.6), (0.2, 0.2, 0.2)),)}), MapSettings())
-    T = looking(0.0)
+    views, T = [], looking(0.0)
     for k in range(6):
-        y = along * k / 5
         cut = k >= 3  # the image ends at the chest
         low, high = -0.4, 0.4 if cut else 1.0
-        person: Solid = ((2.0, y, (low + high) / 2), (0.5, 0.5, high - low))
-        seen = observation(person, BOX, T)
-        assert seen.image is not None
-        edges = np.array([True, not cut, True, True])
-        seen = replace(seen, image=replace(seen.image, edges=edges))
-        known.update((k + 1) * SECOND // 4, [seen], RangeView(np.zeros((0, 3)), T, 0.012))
-    center, size, _ = only(known).box
-    assert abs(size[2] - 1.4) < 0.2
-    assert abs(center[2] - 0.3) < 0.1
-    assert abs(center[1] - along) < 0.1
+        seen = observation(((2.0, along * k / 5, (low + high) / 2), (0.5, 0.5, high - low)), BOX, T)
+        views.append((T, [replace(seen, image=replace(seen.image, edges=np.array([True, not cut, True, True])))]))
+    center, size, _ = only(watched(mapping({BOX: (replace(PERSON, foot=0.0),)}, movers=[BOX]), views)).box
+    assert [size[2], *center[1:]] == pytest.approx([1.4, along, 0.3], abs=0.15)
 
 
 def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
@@ -146,14 +168,13 @@ def test_a_merged_object_has_the_tracks_of_both_and_the_last_ones_are_kept() -> 
     first, second = (after([[(THING, MUG)]] * 3, tracks=[track]).objects[1] for track in (5, 8))
     first.follow(range(10, 30))
     second.seen += 1
-    both = merge(first, second, Kinds([], {}))
+    both = merge(first, second, ClassPriors([], {}))
     assert both.tracks == [*range(15, 30), 8]
     assert MapObject.restored(both.snapshot(), 0.03).tracks == both.tracks
 
 
-def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:
-    lying = after([[(THING, BALL)]] * 6 + [[]] * 2)
-    assert only(lying).id == 1
+def test_ball_at_rest_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:
+    assert only(after([[(THING, BALL)]] * 6 + [[]] * 2)).id == 1
     moved = [[(((2.0, 0.08 * k, 0.1), THING[1]), BALL)] for k in range(1, 9)]
     object = only(after([[(THING, BALL)]] * 6 + moved))
     assert object.id == 1
@@ -162,117 +183,85 @@ def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id
 
 def test_background_that_shows_through_a_small_thing_is_not_taken_for_a_large_one() -> None:
     small, large = SizePrior((0.12, 0.12, 0.2), (0.3, 0.3, 0.2)), SizePrior((0.4, 0.45, 0.9), (0.3, 0.3, 0.2))
-    known = ObjectMap(1, Kinds([], {BOX: (small, large)}), MapSettings())
     plant: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.2))
-    for k in range(6):
-        T = looking(0.4 * np.sin(k))
-        seen = observation(plant, BOX, T)
-        behind = surface(plant)[::4] + np.array([0.6, 0.0, 0.0])
-        each = Observation(np.concatenate([seen.points, behind]), BOX, 0.8, None, seen.image)
-        known.update((k + 1) * SECOND // 4, [each], RangeView((each.points - T[:3, 3]) @ T[:3, :3], T, 0.012))
-    assert only(known).size.max() < 0.3
+    behind = surface(plant)[::4] + np.array([0.6, 0.0, 0.0])
+    views = [(T, [replace(seen, points=np.concatenate([seen.points, behind]))]) for T, (seen,) in around(plant, BOX, 6)]
+    assert only(watched(mapping({BOX: (small, large)}), views)).size.max() < 0.3
 
 
-def carrying(*, portable: bool, lifted: int = 5) -> ObjectMap:
-    """The map after a mug stood beside somebody, who then has it before the mouth."""
-    body = SizePrior((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0)
+def held(places: Sequence[Sequence[float]], *, portable: bool = True, behind: bool = True) -> list[MapObject]:
+    """The mugs of the map after one stood beside a person, then was at other places, with the person or without."""
     mug = SizePrior((0.1, 0.1, 0.1), (0.2, 0.2, 0.2), True)
-    known = ObjectMap(3, Kinds([BOX], {BOX: (body,), MUG: (mug,)}, [BOX], [MUG] if portable else []), MapSettings())
-    somebody: Solid = ((2.0, 0.0, 0.4), (0.4, 0.5, 1.6))
+    roles = {"movers": [BOX], "carriers": [BOX], "portable": [MUG] if portable else []}
+    known = mapping({BOX: (SizePrior((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0),), MUG: (mug,)}, **roles)
     T = looking(0.0)
-    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
-    for k in range(8 + lifted):
-        held: Solid = ((1.7, 0.45, 0.1) if k < 8 else (1.7, 0.1, 0.85), (0.1, 0.1, 0.1))
-        seen = [observation(somebody, BOX, T), observation(held, MUG, T)]
-        points = np.concatenate([wall, *(each.points for each in seen)])
-        known.update((k + 1) * SECOND // 4, seen, RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
-    return known
+    person = observation(((2.0, 0.0, 0.4), (0.4, 0.5, 1.6)), BOX, T)
+    mugs = [observation((place, (0.1, 0.1, 0.1)), MUG, T) for place in [(1.7, 0.45, 0.1)] * 8 + list(places)]
+    watched(known, [(T, [person, each]) for each in mugs], behind=behind)
+    return [o for o in known.confirmed() if o.class_id == MUG]
+
+
+IN_HAND = (1.7, 0.1, 0.85)
 
 
 def test_a_mug_in_a_hand_is_the_mug_that_stood_there() -> None:
-    (held,), (left,) = (
-        [o for o in carrying(portable=portable, lifted=2).confirmed() if o.class_id == MUG]
-        for portable in (True, False)
-    )
-    assert held.center[2] > 0.75
-    assert held.views == 10
+    (carried,), (left,) = (held([IN_HAND] * 2, portable=portable) for portable in (True, False))
+    assert carried.center[2] > 0.75
+    assert carried.views == 10
     assert left.center[2] < 0.2  # what is in a hand is new, and not yet sure
 
 
 def test_a_mug_that_is_put_down_elsewhere_is_still_that_mug() -> None:
-    known = carrying(portable=True)
-    T = looking(0.0)
-    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
-    for k in range(13, 17):
-        each = observation(((1.7, 0.85, 0.1), (0.1, 0.1, 0.1)), MUG, T)
-        points = np.concatenate([wall, each.points])
-        known.update((k + 1) * SECOND // 4, [each], RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
-    (mug,) = [o for o in known.confirmed() if o.class_id == MUG]
+    (mug,) = held([IN_HAND] * 5 + [(1.7, 0.85, 0.1)] * 4)
     assert mug.center[1] > 0.75
     assert not mug.held
 
 
 def test_a_mug_farther_away_than_an_arm_reaches_is_another() -> None:
-    known = carrying(portable=True, lifted=0)
-    T = looking(0.0)
-    other: Solid = ((1.7, -1.4, 0.3), (0.1, 0.1, 0.1))
-    for k in range(9, 14):
-        each = observation(other, MUG, T)
-        known.update((k + 1) * SECOND // 4, [each], RangeView((each.points - T[:3, 3]) @ T[:3, :3], T, 0.012))
-    assert len([o for o in known.confirmed() if o.class_id == MUG]) == 2
+    assert len(held([(1.7, -1.4, 0.3)] * 5, behind=False)) == 2
 
 
-def test_how_high_somebody_is_over_the_floor_tells_how_deep() -> None:
+def test_height_of_a_person_over_the_floor_decides_the_depth_of_the_box() -> None:
     standing = SizePrior((0.4, 0.57, 1.64), (0.3, 0.2, 0.1), True, foot=1.0)
     sitting = SizePrior((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, foot=1.0)
-
-    def depth(top: float) -> float:
-        known = ObjectMap(1, Kinds([BOX], {BOX: (standing, sitting)}), MapSettings())
+    depths = []
+    for top in (1.3, 0.95):
+        known, T = mapping({BOX: (standing, sitting)}, movers=[BOX]), looking(0.0)
         known.floor = -0.4
-        T = looking(0.0)
-        trunk: Solid = ((2.0, 0.0, top - 0.35), (0.3, 0.5, 0.7))
-        for k in range(4):
-            known.update((k + 1) * SECOND // 4, [observation(trunk, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
-        return float(only(known).size[:2].max())
-
-    assert depth(1.3) < 0.6 < depth(0.95)
+        watched(known, [(T, [observation(((2.0, 0.0, top - 0.35), (0.3, 0.5, 0.7)), BOX, T)])] * 4)
+        depths.append(float(only(known).size[:2].max()))
+    assert depths[0] < 0.6 < depths[1]
 
 
-def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
-    beside: Solid = ((2.0, 0.13, 0.1), THING[1])
-    known = after([[(THING, BOX), (beside, MUG)]] * 5)
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
-    again.restore(known.snapshot())
-    assert [o.beside for o in again.objects.values()] == [o.beside for o in known.objects.values()]
+@pytest.mark.parametrize("lacks", [(), ("beside",), ("told",)], ids=["", "without neighbours", "without times"])
+def test_a_snapshot_is_taken_up_also_from_before_something_was_counted(lacks: Sequence[str]) -> None:
+    known = after([[(THING, BOX), (BESIDE, MUG)]] * 5)
+    earlier = known.snapshot()
+    for entry in earlier["objects"]:
+        for name in lacks:
+            del entry[name]
+    again = ObjectMap(3, ClassPriors([BALL], BALL_SIZE), MapSettings())
+    again.restore(earlier)
+    assert [o.sightings for o in again.objects.values()] == [5, 5]
+    counted = {} if "beside" in lacks else known.objects[1].beside
+    assert again.objects[1].beside == counted
     assert known.objects[1].beside[2] > 0
 
 
 def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
-    beside: Solid = ((2.0, 0.13, 0.1), (0.12, 0.12, 0.12))
-    both = [[(THING, BOX), (beside, BOX)]] * 3
-
+    both = [[(THING, BOX), (BESIDE, BOX)]] * 3
     assert sum(len(o.beside) for o in after(both).objects.values()) == 2
     known = after([*both[:2], *[[(THING, BOX)]] * 10])
     assert len(known.objects) == 1
     assert not only(known).beside
 
 
-def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
-    known = after([[(THING, BOX)]] * 5)
-    earlier = known.snapshot()
-    for entry in earlier["objects"]:
-        del entry["beside"]
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
-    again.restore(earlier)
-    assert list(again.objects) == list(known.objects)
-
-
 @pytest.mark.parametrize("rate", [10, 20, 50])
-def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int) -> None:
-    known = ObjectMap(3, Kinds([], {}), MapSettings())
-    T, nothing = looking(0.0), RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
+def test_evidence_is_independent_of_the_rate_of_images(rate: int) -> None:
+    known = mapping()
+    T = looking(0.0)
     for k in range(rate * 2 // 5 + 1):
-        known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], nothing)
+        known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], NOTHING)
     object = only(known)
     assert object.sightings == 5
     assert object.evidence == pytest.approx(5 * np.log(0.6 / 0.4))
@@ -280,21 +269,18 @@ def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int
 
 @pytest.mark.parametrize(("seconds", "given"), [(0.1, 0), (0.3, 1)])
 def test_what_images_in_a_flash_show_is_not_yet_there(seconds: float, given: int) -> None:
-    known = ObjectMap(3, Kinds([], {}), MapSettings())
-    nothing = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
+    known = mapping()
     for k in range(4):
         stamp = SECOND + round(k * seconds / 3 * SECOND)
-        known.update(stamp, [observation(THING, BOX, looking(0.0))], nothing)
+        known.update(stamp, [observation(THING, BOX, looking(0.0))], NOTHING)
     assert len(known.confirmed()) == given
 
 
 @pytest.mark.parametrize("rate", [10, 50])
 def test_an_empty_place_is_given_up_as_soon_at_any_rate_of_images(rate: int) -> None:
-    known = after([[(THING, BOX)]] * 8)
-    T = looking(0.0)
-    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
-    empty = RangeView((wall - T[:3, 3]) @ T[:3, :3], T, 0.012)
-    only(known).cells.hits[:] = 1000  # so that its voxels are not what goes first
+    known, T = after([[(THING, BOX)]] * 8), looking(0.0)
+    empty = RangeView((WALL - T[:3, 3]) @ T[:3, :3], T, 0.012)
+    only(known).voxels.hits[:] = 1000  # so that its voxels are not what goes first
     for k in range(1, 3 * rate + 1):
         known.update(2 * SECOND + k * SECOND // rate, [], empty)
         if not known.objects:
@@ -302,68 +288,37 @@ def test_an_empty_place_is_given_up_as_soon_at_any_rate_of_images(rate: int) -> 
     assert k / rate == pytest.approx(0.7, abs=0.1)
 
 
-def test_a_snapshot_from_before_times_of_views_were_summed_is_taken_up() -> None:
-    known = after([[(THING, BOX)]] * 5)
-    earlier = known.snapshot()
-    for entry in earlier["objects"]:
-        del entry["told"]
-    again = ObjectMap(3, Kinds([BALL], BALL_SIZE), MapSettings())
-    again.restore(earlier)
-    assert [o.sightings for o in again.objects.values()] == [5]
-
-
 @pytest.mark.parametrize(("length", "doubt"), [(0.14, 0.0), (0.8, 0.5)])
 def test_a_thing_larger_than_any_of_its_class_is_given_with_its_doubt(length: float, doubt: float) -> None:
-    size = {BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}
-    known = ObjectMap(3, Kinds([], size), MapSettings())
-    for k in range(6):
-        eye = looking(0.2 * k)
-        seen = [observation(((2.0, 0.0, 0.1), (0.12, length, 0.12)), BOX, eye)]
-        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), looking(0.0), 0.012))
+    known = mapping({BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)})
+    watched(known, around(((2.0, 0.0, 0.1), (0.12, length, 0.12)), BOX, 6))
     assert known.doubt(only(known)) == doubt
 
 
 @pytest.mark.parametrize(
-    ("class_id", "score", "doubt"), [(MUG, 0.28, 0.2), (MUG, 0.4, 0.0), (BOX, 0.28, 0.0)], ids=["weak", "sure", "a box"]
+    ("labels", "score", "doubt"),
+    [
+        ([MUG] * 12, 0.28, 0.2),
+        ([MUG] * 12, 0.4, 0.0),
+        ([BOX] * 12, 0.28, 0.0),  # nothing that is taken away
+        ([MUG] * 12, 0.6, 0.0),
+        ([MUG, BALL] * 6, 0.6, 1 / 7),  # a mean of 0.3 for each class
+        ([MUG, BALL] * 3 + [BALL] * 6, 0.6, 0.0),
+    ],
 )
-def test_a_weak_label_of_a_small_thing_is_doubted(class_id: int, score: float, doubt: float) -> None:
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
-    for k in range(12):
-        T = looking(0.4 * np.sin(k))
-        seen = [replace(observation(THING, class_id, T), score=score)]
-        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
-    assert known.doubt(only(known)) == pytest.approx(doubt)
-
-
-@pytest.mark.parametrize(("mugs", "balls", "doubt"), [(12, 0, 0.0), (6, 6, 1 / 7), (3, 9, 0.0)])
-def test_a_thing_called_a_mug_and_a_ball_alike_is_given_with_its_doubt(mugs: int, balls: int, doubt: float) -> None:
-    """Labels of 0.6: by turns, that is a mean of 0.3 for each class."""
-    known = ObjectMap(3, Kinds([BALL], BALL_SIZE, portable=[MUG]), MapSettings())
-    labels = [MUG, BALL] * min(mugs, balls) + [MUG if mugs > balls else BALL] * abs(mugs - balls)
+def test_a_weak_or_divided_label_of_a_small_thing_is_doubted(labels: list[int], score: float, doubt: float) -> None:
+    known = mapping(BALL_SIZE, movers=[BALL], portable=[MUG])
     for k, label in enumerate(labels):
-        T = looking(0.4 * np.sin(k))
-        seen = [replace(observation(THING, label, T), score=0.6)]
-        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
+        watched(known, around(THING, label, k + 1, score)[-1:])
     assert known.doubt(only(known)) == pytest.approx(doubt)
-
-
-@pytest.mark.parametrize(("foot", "reaches_down"), [(0.2, True), (0.0, False)])
-def test_furniture_reaches_down_to_the_floor_where_its_class_stands_there(foot: float, reaches_down: bool) -> None:
-    known = ObjectMap(3, Kinds([], {BOX: (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=foot),)}), MapSettings())
-    known.floor = -0.4
-    for k in range(6):
-        seen = [observation(((2.5, 0.0, 0.12), (0.5, 0.5, 0.8)), BOX, looking(0.3 * np.sin(k)))]
-        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), looking(0.0), 0.012))
-    center, box, _ = only(known).box
-    assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
 
 
 def test_views_from_afar_are_dropped_for_near_ones_and_a_snapshot_holds_those_kept() -> None:
-    known = ObjectMap(3, Kinds([], {BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}), MapSettings())
+    known = mapping({BOX: (SizePrior((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)})
     for k, back in enumerate([3.0, 2.8, 2.6, 2.4, 0.6, 0.5, 0.4, 0.3]):
         T = looking(0.1 * k)
         T[0, 3] = -back
-        known.update((k + 1) * SECOND // 4, [observation(THING, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+        watched(known, [(T, [observation(THING, BOX, T)])])
     object = only(known)
     assert len(object.images) == 4
     assert max(float(np.linalg.norm(v.eye - object.center)) for v in object.images) < 3.0
@@ -378,15 +333,11 @@ def test_a_chair_before_a_desk_whose_masks_hold_both_does_not_move_the_desk() ->
     desk: Solid = ((2.5, 0.0, 0.0), (0.7, 1.5, 0.75))
     chair: Solid = ((1.8, 0.4, 0.0), (0.1, 0.45, 0.7))
     sizes = {
-        BOX: (SizePrior((0.6, 1.5, 0.75), (0.4, 0.4, 0.16)),),
-        MUG: (SizePrior((0.1, 0.45, 0.7), (0.2, 0.2, 0.2)),),
-    }
-    known = ObjectMap(3, Kinds([], sizes), MapSettings())
-    for k in range(12):
-        T = looking(0.4 * np.sin(k))
-        whole, front = observation(desk, BOX, T), observation(chair, MUG, T)
-        bled = replace(whole, points=np.concatenate([whole.points, front.points[::2]]))
-        known.update((k + 1) * SECOND // 4, [bled, front], RangeView(np.zeros((0, 3)), T, 0.012))
-    found = {o.class_id: o for o in known.confirmed()}[BOX]
+        BOX: (SizePrior((0.6, 1.5, 0.75), (0.4, 0.4, 0.16)),), MUG: (SizePrior((0.1, 0.45, 0.7), (0.2, 0.2, 0.2)),),
+    }  # fmt: skip
+    views = []
+    for (T, (whole,)), (_, (front,)) in zip(around(desk, BOX, 12), around(chair, MUG, 12), strict=True):
+        views.append((T, [replace(whole, points=np.concatenate([whole.points, front.points[::2]])), front]))
+    found = {o.class_id: o for o in watched(mapping(sizes), views).confirmed()}[BOX]
     deep = abs(np.cos(found.yaw)) * found.size[0] + abs(np.sin(found.yaw)) * found.size[1]
     assert float(found.center[0] - deep / 2) > 2.0  # the desk's front is at 2.15, the chair's at 1.75

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from repeated import assert_repeats
 
-from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose, SceneGraph
-from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.messages import Boxes3D, Clusters, PointCloud, Pose
 from operators.scene import SemanticMap
 from operators.scene.map.map_surface import MapSurface
 from operators.scene.map.range_view import RangeView
@@ -120,88 +121,56 @@ def test_a_table_top_that_a_view_looks_through_goes_and_one_out_of_sight_stays()
     assert [s.center[1] > 20 for s in known.confirmed] == [True]
 
 
-def surfaces(stamp: int, parts: Sequence[tuple[str, Array, tuple[float, float]]]) -> Boxes3D:
-    """Boxes as PlaneSegmenter gives them: the class, T_cloud_rectangle (4, 4), and the size on the plane."""
-    names = ("floor", "wall", "table", "ceiling", "other")
-    T = np.array([T for _, T, _ in parts]).reshape(-1, 4, 4)
+def surfaces(stamp: int) -> Boxes3D:
+    """A floor, a table and something else, as PlaneSegmenter gives them."""
+    names, none = ("floor", "wall", "table", "ceiling", "other"), np.tile([0, 0, 0, 1.0], (3, 1))
     return Boxes3D(
-        stamp=stamp,
-        frame="camera",
-        class_names=names,
-        centers=T[:, :3, 3],
-        sizes=np.array([[*size, 0.02] for _, _, size in parts]).reshape(-1, 3),
-        orientations=matrix_to_quaternion(T),
-        scores=np.ones(len(parts), np.float32),
-        class_ids=np.array([names.index(name) for name, _, _ in parts], np.int32),
-    )
+        stamp=stamp, frame="camera", class_names=names, centers=[[2.5, 0, -1], [1.6, 1.4, -0.3], [2, 0, 0]],
+        sizes=[[3.0, 2.0, 0.02], [1.2, 0.8, 0.02], [9, 9, 0.02]], orientations=none, scores=np.ones(3),
+        class_ids=np.array([0, 2, 4], np.int32),
+    )  # fmt: skip
 
 
-def step(known: SemanticMap, stamp: int, given: Boxes3D | None) -> SceneGraph:
+def view_of_a_table(stamp: int, given: Boxes3D | None) -> dict[str, Any]:
     """One view without objects of a floor 1 m below the camera and a table top 0.3 m below it."""
     points = np.concatenate([sheet((1, -1, -1), (3, 0, 0), (0, 2, 0)), sheet((1, 1, -0.3), (1.2, 0, 0), (0, 0.8, 0))])
-    cloud = PointCloud(stamp=stamp, frame="camera", points=points.astype(np.float32))
     none = np.zeros((0, 3))
-    boxes = Boxes3D(
-        stamp=stamp,
-        frame="camera",
-        class_names=("mug",),
-        centers=none,
-        sizes=none,
-        orientations=np.zeros((0, 4)),
-        scores=np.zeros(0, np.float32),
-        class_ids=np.zeros(0, np.int32),
-    )
-    labels = np.full(len(points), -1, np.int32)
-    clusters = Clusters(stamp=stamp, frame="camera", labels=labels, centroids=none)
-    pose = Pose(stamp=stamp, frame="map", child_frame="camera", position=[0, 0, 1], orientation=[0, 0, 0, 1])
-    nodes = known.process(boxes, clusters, cloud, pose, surfaces=given)["nodes"]
-    assert isinstance(nodes, SceneGraph)
-    return nodes
-
-
-def at(x: float, y: float, z: float) -> Array:
-    T = np.eye(4)
-    T[:3, 3] = (x, y, z)
-    return T
-
-
-PARTS = [
-    ("floor", at(2.5, 0, -1), (3.0, 2.0)),
-    ("table", at(1.6, 1.4, -0.3), (1.2, 0.8)),
-    ("other", at(2, 0, 0), (9.0, 9.0)),
-]
+    return {
+        "boxes": Boxes3D(
+            stamp=stamp, frame="camera", class_names=("mug",), centers=none, sizes=none,
+            orientations=np.zeros((0, 4)), scores=np.zeros(0, np.float32), class_ids=np.zeros(0, np.int32),
+        ),
+        "clusters": Clusters(
+            stamp=stamp, frame="camera", labels=np.full(len(points), -1, np.int32), centroids=none
+        ),
+        "cloud": PointCloud(stamp=stamp, frame="camera", points=points.astype(np.float32)),
+        "pose": Pose(stamp=stamp, frame="map", child_frame="camera", position=[0, 0, 1], orientation=[0, 0, 0, 1]),
+        "surfaces": given,
+    }  # fmt: skip
 
 
 def test_the_map_has_surfaces_as_nodes_beside_its_objects() -> None:
     known = SemanticMap(labels="simulator")
     known.setup()
-    for k in range(2):
-        nodes = step(known, (k + 1) * SECOND, surfaces((k + 1) * SECOND, PARTS))
+    for k in (1, 2):
+        nodes = known.process(**view_of_a_table(k * SECOND, surfaces(k * SECOND)))["nodes"]
     named = [nodes.class_names[c] for c in nodes.class_ids]
     assert list(zip(nodes.ids.tolist(), named, strict=True)) == [(0, "floor"), (-12, "tabletop")]
     assert np.allclose(nodes.positions[:, 2], [0, 0.7], atol=0.02)
     assert np.allclose(np.sort(nodes.sizes[1]), [0.02, 0.8, 1.2], atol=0.11)
-    assert nodes.last_seen is not None
     assert nodes.last_seen.tolist() == [2 * SECOND] * 2
-    later = step(known, 3 * SECOND, None)
+    later = known.process(**view_of_a_table(3 * SECOND, None))["nodes"]
     assert later.ids.tolist() == nodes.ids.tolist()
 
 
 def test_surfaces_of_another_time_are_not_used_and_of_another_frame_are_refused() -> None:
     known = SemanticMap(labels="simulator", surface_views=1)
     known.setup()
-    assert step(known, 2 * SECOND, surfaces(SECOND, PARTS)).count == 0
+    assert known.process(**view_of_a_table(2 * SECOND, surfaces(SECOND)))["nodes"].count == 0
     with pytest.raises(ValueError, match="the surfaces are in 'lidar', the cloud in 'camera'"):
-        step(known, 3 * SECOND, surfaces(3 * SECOND, PARTS).replace(frame="lidar"))
+        known.process(**view_of_a_table(3 * SECOND, surfaces(3 * SECOND).replace(frame="lidar")))
 
 
 def test_a_restored_map_goes_on_with_its_surfaces() -> None:
-    first, other = SemanticMap(labels="simulator"), SemanticMap(labels="simulator")
-    for each in (first, other):
-        each.setup()
-    for k in range(3):
-        step(first, (k + 1) * SECOND, surfaces((k + 1) * SECOND, PARTS))
-    other.restore(first.snapshot())
-    a, b = (step(each, 4 * SECOND, surfaces(4 * SECOND, PARTS)) for each in (first, other))
-    assert a.digest() == b.digest()
-    assert a.count == 2
+    calls = [view_of_a_table(k * SECOND, surfaces(k * SECOND)) for k in range(1, 5)]
+    assert_repeats(partial(SemanticMap, labels="simulator"), calls, 3)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Path
-from operators.scene.map.cells import Cells
 from operators.scene.map.trajectory import Correction, Trajectory
+from operators.scene.map.voxels import VoxelSet
 
 STEP = 200_000_000  # ns
 
@@ -30,12 +30,12 @@ def test_what_was_seen_between_two_keyframes_moves_by_what_lies_between_their_co
 
 def test_each_voxel_moves_with_the_place_from_which_it_was_seen() -> None:
     points = np.random.default_rng(2).uniform(0, 1, (500, 3))
-    early, late = Cells.of(points, 0.05, 0), Cells.of(points + np.array([1.0, 0, 0]), 0.05, 10 * STEP)
+    early, late = VoxelSet.of(points, 0.05, 0), VoxelSet.of(points + np.array([1.0, 0, 0]), 0.05, 10 * STEP)
     early.add(late)
     hits = early.hits.sum()
     early.correct(Correction([0, 10 * STEP], np.stack([np.eye(4), motion(-1.0, 0, 0)])))
     assert early.hits.sum() == pytest.approx(hits)
-    np.testing.assert_allclose(early.extent, Cells.of(points, 0.05).extent, atol=0.06)
+    np.testing.assert_allclose(early.extent, VoxelSet.of(points, 0.05).extent, atol=0.06)
     assert (early.hits == 2).mean() > 0.9  # of the same places
 
 
@@ -80,7 +80,6 @@ def test_keyframes_move_the_poses_at_their_times_and_those_behind_them_as_the_la
         keyframes([2 * STEP, 5 * STEP // 2, 4 * STEP], [motion(2, 0, 0), motion(2.5, 0, 0), turned])
     )
 
-    assert correction is not None
     assert correction.stamps == [2 * STEP, 5 * STEP // 2, 4 * STEP]
     np.testing.assert_allclose(correction.motions[:2], np.stack([np.eye(4)] * 2), atol=1e-9)
     by = turned @ np.linalg.inv(motion(4, 0, 0))
@@ -97,7 +96,6 @@ def test_keyframes_that_agree_move_nothing_and_those_of_other_times_are_passed_o
 
     correction = trajectory.corrected(known)
 
-    assert correction is not None
     assert correction.stamps == [0, 9 * STEP]
     np.testing.assert_allclose(correction.motions, np.stack([np.eye(4)] * 2), atol=1e-9)
     assert Trajectory().corrected(known) is None

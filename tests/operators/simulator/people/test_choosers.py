@@ -46,7 +46,7 @@ def test_there_are_as_many_persons_as_are_asked_for(name: str) -> None:
 def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: int) -> None:
     here = world(name, seed)
     for person in choosers(here):
-        timeline = person.mover.timeline  # type: ignore[attr-defined]
+        timeline = person.mover.timeline
         goals = {act.goal for act in timeline.acts}
         assert len(goals) == 6
         reached = set()
@@ -73,7 +73,7 @@ def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: 
 def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
     """From the choice until the hand or the pelvis moves there are seconds in which to infer it."""
     for person in choosers(world(name, 0)):
-        acts, leads, lead = person.mover.timeline.acts, [], 0.0  # type: ignore[attr-defined]
+        acts, leads, lead = person.mover.timeline.acts, [], 0.0
         for act in acts:
             lead = lead + act.seconds if act.activity in ("standing", "walking") else 0.0
             if act.activity == "walking":

@@ -125,16 +125,16 @@ def test_lidar_points_lie_on_what_is_there_and_noise_is_along_the_beam() -> None
     )
     source = robot(duration="1s", lidar=settings_)
     T = source._stage.T_world_base(0.0) @ mounted(source.lidar.mount)
-    points = exact.points.astype(np.float64)  # type: ignore[attr-defined]
+    points = exact.points.astype(np.float64)
     beyond = transform_points(T, points * 1.02) - T[:3, 3]
     short = transform_points(T, points * 0.98) - T[:3, 3]
     origin = np.broadcast_to(T[:3, 3], beyond.shape)
     renderer = source._stage.at(0.0)
     assert renderer.blocked(np.concatenate([origin, beyond], axis=1).astype(np.float32)).all()
     assert not renderer.blocked(np.concatenate([origin, short], axis=1).astype(np.float32)).any()
-    error = np.linalg.norm(noisy.points, axis=1) - np.linalg.norm(exact.points, axis=1)  # type: ignore[attr-defined]
+    error = np.linalg.norm(noisy.points, axis=1) - np.linalg.norm(exact.points, axis=1)
     assert error.std() == pytest.approx(0.05, rel=0.15)
-    angle = np.abs(np.cross(noisy.points, exact.points)).max()  # type: ignore[attr-defined]
+    angle = np.abs(np.cross(noisy.points, exact.points)).max()
     assert angle < 1e-3
 
 
@@ -171,7 +171,7 @@ def test_the_stereo_pair_sees_points_at_the_disparity_of_their_depth() -> None:
         stereo={"rate": 10, **size, "baseline": 0.1, "read_noise": 0, "shot_noise": 0},
     )  # fmt: skip
     (step,) = source.stream()
-    left, right, z = (step[port].data.astype(np.float64) for port in ("left", "right", "depth"))  # type: ignore[attr-defined]
+    left, right, z = (step[port].data.astype(np.float64) for port in ("left", "right", "depth"))
     rows, columns = np.nonzero(z > 0)
     shifted = columns - 0.85 * 320 * 0.1 / z[rows, columns]
     inside = shifted >= 0
@@ -223,21 +223,21 @@ def test_the_stereo_pair_sees_from_its_own_mount() -> None:
 @pytest.mark.long
 def test_a_moving_lidar_says_when_it_measured() -> None:
     (cloud,) = stream(robot(duration="200ms", lidar={"rate": 5, "columns": 60, "rings": 2, "motion": True}), "points")
-    assert cloud.time_offsets.min() >= -0.2  # type: ignore[attr-defined]
-    assert cloud.time_offsets.max() == 0  # type: ignore[attr-defined]
-    assert (np.diff(cloud.time_offsets) >= 0).all()  # type: ignore[attr-defined]
+    assert cloud.time_offsets.min() >= -0.2
+    assert cloud.time_offsets.max() == 0
+    assert (np.diff(cloud.time_offsets) >= 0).all()
 
 
 @pytest.mark.long
 def test_imu_noise_has_its_density_and_the_bias_walks() -> None:
     base = {"rate": 200, "gyro_walk": 0, "accel_walk": 0, "accel_noise": 0.01}
     white = stream(robot(duration="10s", hold=20, inertial={**base, "gyro_noise": 0.002}), "imu")
-    gyro = np.array([m.angular_velocity for m in white])  # type: ignore[attr-defined]
-    force = np.array([m.linear_acceleration for m in white])  # type: ignore[attr-defined]
+    gyro = np.array([m.angular_velocity for m in white])
+    force = np.array([m.linear_acceleration for m in white])
     assert gyro.std() == pytest.approx(0.002 * math.sqrt(200), rel=0.05)
     assert (force - [0, 0, 9.80665]).std() == pytest.approx(0.01 * math.sqrt(200), rel=0.05)
     walking = stream(robot(duration="10s", hold=20, inertial={**base, "gyro_noise": 0, "gyro_walk": 0.01}), "imu")
-    gyro = np.array([m.angular_velocity for m in walking])  # type: ignore[attr-defined]
+    gyro = np.array([m.angular_velocity for m in walking])
     assert np.diff(gyro, axis=0).std() == pytest.approx(0.01 / math.sqrt(200), rel=0.1)
 
 
@@ -250,11 +250,11 @@ def test_wheels_without_error_follow_the_path_and_with_it_drift() -> None:
     c, s = math.cos(first.yaw[0]), math.sin(first.yaw[0])
     expected = np.array([c * offset[0] + s * offset[1], -s * offset[0] + c * offset[1]])
     exact = stream(source, "wheel_odometry")[-1]
-    np.testing.assert_allclose(exact.position[:2], expected, atol=2e-3)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(exact.position[:2], expected, atol=2e-3)
     real = stream(robot(duration="10s", wheels={"rate": 50}), "wheel_odometry")[-1]
-    error = np.linalg.norm(real.position[:2] - expected)  # type: ignore[attr-defined]
+    error = np.linalg.norm(real.position[:2] - expected)
     assert 5e-3 < error < 1.0
-    assert error < 5 * math.sqrt(np.trace(real.pose_covariance[:2, :2]))  # type: ignore[attr-defined]
+    assert error < 5 * math.sqrt(np.trace(real.pose_covariance[:2, :2]))
 
 
 @pytest.mark.long
@@ -265,7 +265,7 @@ def test_radar_sees_the_still_world_come_nearer_as_the_robot_drives() -> None:
     )  # fmt: skip
     for scan in stream(source, "radar_scan"):
         speed = source._stage.world.path.at([scan.stamp * 1e-9]).speed()[0]
-        np.testing.assert_allclose(scan.velocities, -speed * np.cos(scan.azimuths), atol=0.03)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(scan.velocities, -speed * np.cos(scan.azimuths), atol=0.03)
 
 
 @dataclass(frozen=True)
@@ -430,7 +430,7 @@ def test_landmarks_are_where_the_map_says() -> None:
     source = robot(
         duration="2s", landmarks={"rate": 2, "range_noise": 0, "bearing_noise": 0, "missing": 0, "max_range": 20}
     )
-    places = source.static_outputs()["landmark_map"].positions  # type: ignore[attr-defined]
+    places = source.static_outputs()["landmark_map"].positions
     for message in stream(source, "sightings"):
         T = source._stage.T_world_base(message.stamp * 1e-9) @ mounted(source.landmarks.mount)
         m: Any = message
@@ -518,7 +518,7 @@ def test_a_magnetometer_points_north_and_down() -> None:
 def test_iron_bends_the_field_of_a_magnetometer() -> None:
     base = {"rate": 10, "noise": 0}
     plain, iron, bent, noisy = (
-        np.array([m.field for m in stream(robot(duration="20s", magnetometer={**base, **more}), "magnetic_field")])  # type: ignore[attr-defined]
+        np.array([m.field for m in stream(robot(duration="20s", magnetometer={**base, **more}), "magnetic_field")])
         for more in ({}, {"hard_iron": [1e-6, 2e-6, 0], "soft_iron": 0.1}, {"disturbance": 3e-6}, {"noise": 1e-6})
     )
     np.testing.assert_allclose(iron, plain * [1.1, 1, 1] + [1e-6, 2e-6, 0], atol=1e-12)

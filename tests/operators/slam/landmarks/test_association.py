@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from operator_runs import assert_resumes_alike
 
 from dataflow.messages import Level
 from dataflow.testing import play
@@ -42,7 +43,7 @@ def test_a_robot_that_drifted_by_the_distance_between_landmarks_is_placed_by_the
     assert abs(made.heading - true[2]) < 0.05
 
 
-def test_a_row_of_equal_distances_places_nobody() -> None:
+def test_a_row_of_equal_distances_does_not_relocalise() -> None:
     row = np.array([[x, 1.5] for x in np.arange(-4.0, 5.0)])
     made = LandmarkFilter()
     see(made, row, times=4)
@@ -97,7 +98,7 @@ def test_pairs_that_two_pairings_explain_alike_are_not_agreed() -> None:
     assert agreed_pairs(nearer[1::2], covariance[:4, :4], conflicts[1::2, 1::2], 0.01) == [0, 1]
 
 
-def test_odometry_noisier_than_told_is_reported_and_the_map_stays_whole() -> None:
+def test_odometry_noisier_than_its_covariance_is_reported_and_the_map_stays_whole() -> None:
     walk, told = Walk(3), np.diag([0.007**2, 0.0035**2, 0.0035**2])
     made = LandmarkFilter()
     states = set()
@@ -114,19 +115,9 @@ def test_odometry_noisier_than_told_is_reported_and_the_map_stays_whole() -> Non
 
 @pytest.mark.long
 @pytest.mark.parametrize("half", [40, 70])
-def test_a_snapshot_without_identities_goes_on_as_the_operator_would(half: int) -> None:
+def test_operator_without_identities_resumes_alike(half: int) -> None:
     messages = Walk(4).messages(known=False)
-    whole = LandmarkSlam()
-    whole.setup()
-    for k, (odometry, sightings) in enumerate(zip(messages["odometry"], messages["sightings"], strict=True)):
-        if k == half:
-            copy = LandmarkSlam()
-            copy.setup()
-            copy.restore(whole.snapshot())
-        expected = whole.process(odometry, sightings) or {}  # type: ignore[arg-type]
-        if k >= half:
-            got = copy.process(odometry, sightings) or {}  # type: ignore[arg-type]
-            assert {port: m.digest() for port, m in got.items()} == {port: m.digest() for port, m in expected.items()}
+    assert_resumes_alike(LandmarkSlam, list(zip(messages["odometry"], messages["sightings"], strict=True)), half)
 
 
 def test_the_status_is_given_every_second_and_names_what_was_done() -> None:

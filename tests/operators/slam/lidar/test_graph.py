@@ -55,7 +55,7 @@ def test_a_map_is_not_found_where_another_part_of_it_explains_the_scan_as_well(b
         for k in range(4)
     ]
     eyes = Corridor(both=both)
-    graph = LidarGraph(LidarSettings(), eyes)  # type: ignore[arg-type]
+    graph = LidarGraph(LidarSettings(), eyes)
     graph.begin_in(nodes)
     added, looks = list[Added](), [0]
     for k in range(20):
@@ -76,7 +76,7 @@ def test_rivals_of_a_place_are_looked_at_before_the_scan_that_confirms_it() -> N
         for k, x in enumerate(places)
     ]
     eyes = Corridor(both=False)
-    graph = LidarGraph(LidarSettings(), eyes)  # type: ignore[arg-type]
+    graph = LidarGraph(LidarSettings(), eyes)
     graph.begin_in(nodes)
     looks, found = [0], list[bool]()
     for k in range(12):

@@ -9,21 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from operator_runs import assert_resumes_alike, errors_in_map, texts
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import PointCloud, Transforms
 from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play
 from operators.cloud.registration import Settings
 from operators.geometry.se3 import Matrix
 from operators.odometry import LidarOdometry
-from operators.odometry.lidar.tracker import State, Tracked
+from operators.odometry.lidar.tracker import Tracked
+from operators.odometry.tracking import Status
 from operators.slam import LidarSlam
 from operators.slam.lidar.graph import LidarGraph, LidarSettings
 from operators.slam.lidar.map_file import read_lidar_map
-from operators.slam.lidar.mapper import LidarMapper, Mapped
+from operators.slam.lidar.mapper import LidarMapper
 from operators.slam.lidar.view import LidarEyes, LidarView
-from operators.slam.place import Place
+from operators.slam.place import Mapped, Place
 from tests.support.made_scans import HALL, HALL_BOXES, NOTHING, at, drifting, on_round, scan
 
 ROUND = 28  # scans
@@ -49,18 +50,7 @@ def clouds(poses: Sequence[Matrix], room: str = "room", first: int = 0) -> list[
 
 
 def run(given: list[PointCloud], **params: object) -> Played:
-    return play(LidarSlam(**(NEAR | params)), {"cloud": given})  # type: ignore[arg-type]
-
-
-def texts(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]
-
-
-def errors(poses: Sequence, truth: Sequence[Matrix], origin: Matrix) -> NDArray[np.float64]:  # type: ignore[type-arg]
-    """Distance (m) of poses in the map from the truth, where the map's origin is known; no alignment."""
-    return np.array(
-        [np.linalg.norm((origin @ p.matrix())[:3, 3] - T[:3, 3]) for p, T in zip(poses, truth, strict=True)]
-    )
+    return play(LidarSlam(**(NEAR | params)), {"cloud": given})
 
 
 def elsewhere(count: int) -> list[Matrix]:
@@ -101,7 +91,7 @@ def test_a_place_seen_again_is_a_loop_and_the_map_does_not_grow_there(around: Pl
     assert not any(text.startswith("corrected") for text in told[: ROUND // 2])
     views = [int(s.values[s.keys.index("views")]) for s in around["status"]]
     assert views[-1] - views[ROUND - 1] <= 1
-    assert errors(around["pose"], on_round(ROUND + 5), on_round(1)[0]).max() < 0.03
+    assert errors_in_map(around["pose"], on_round(ROUND + 5), on_round(1)[0]).max() < 0.03
     assert len(around["path"]) > 0
     assert len(around["map"]) > 0
 
@@ -111,10 +101,10 @@ def test_poses_are_those_of_the_body_where_one_is_named() -> None:
     mount = at(0.3, 0.1, 0.4)
     extrinsics = Transforms.from_matrix(mount, stamp=0, frame="base_link", child_frame="lidar")
     given = {"cloud": clouds(on_round(ROUND + 4)), "extrinsics": [extrinsics]}
-    played = play(LidarSlam(body_frame="base_link", **NEAR), given, static=("extrinsics",))  # type: ignore[arg-type]
+    played = play(LidarSlam(body_frame="base_link", **NEAR), given, static=("extrinsics",))
     bodies = [T @ invert(mount) for T in on_round(ROUND + 4)]
     assert played["pose"][-1].child_frame == "base_link"
-    assert errors(played["pose"], bodies, bodies[0]).max() < 0.03
+    assert errors_in_map(played["pose"], bodies, bodies[0]).max() < 0.03
     walls = played["map"][-1].points @ bodies[0][:3, :3].T + bodies[0][:3, 3]
     assert np.quantile(np.abs(walls[:, 0]), 0.99) == pytest.approx(4.0, abs=0.1)  # half the room's length
 
@@ -138,7 +128,7 @@ def mapper(rivals: int = 3) -> LidarMapper:
 
 
 def tracked(
-    T: Matrix, points: NDArray[np.float32] | None, covariance: Matrix, state: State = State.TRACKING
+    T: Matrix, points: NDArray[np.float32] | None, covariance: Matrix, state: Status = Status.TRACKING
 ) -> Tracked:
     none = np.zeros((0, 6))
     given = None if points is None else points.astype(np.float64)
@@ -175,7 +165,7 @@ def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the
     """The LiDAR is lost and carried across the room; its odometry begins anew, with a pose that means nothing."""
     slam, poses = mapper(), on_round(ROUND)
     mapped(poses, [invert(poses[0]) @ T for T in poses], slam)
-    lost = slam.take(tracked(np.eye(4), None, np.eye(6), State.LOST), 40 * STEP)
+    lost = slam.take(tracked(np.eye(4), None, np.eye(6), Status.LOST), 40 * STEP)
     assert (lost.place, lost.T_map_odom) == (Place.ADRIFT, None)
     there, wrong = elsewhere(16), at(9.0, -4.0, 1.0)
     results = [
@@ -201,7 +191,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     played = run(clouds(poses, first=60), map_file=str(saved))
     assert "corrected: the map is found" in texts(played)
     assert len(played["pose"]) >= 5
-    assert errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
+    assert errors_in_map(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0]).max() < 0.04
 
 
 @pytest.mark.long
@@ -228,25 +218,6 @@ def test_a_saved_map_has_the_same_bytes_each_time(tmp_path: Path) -> None:
     assert len(read_lidar_map(tmp_path / "a.npz")) > 2
 
 
-@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_map_is_refused(tmp_path: Path, content: bytes) -> None:
-    file = tmp_path / "wrong.npz"
-    file.write_bytes(content)
-    with pytest.raises(ValueError, match="is no LiDAR map"):
-        read_lidar_map(file)
-
-
-def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "new.npz", version=np.array(99))
-    with pytest.raises(ValueError, match="version 99"):
-        read_lidar_map(tmp_path / "new.npz")
-    np.savez(tmp_path / "cut.npz", version=np.array(1))
-    with pytest.raises(ValueError, match="damaged"):
-        read_lidar_map(tmp_path / "cut.npz")
-    with pytest.raises(FileNotFoundError):
-        LidarSlam(map_file=str(tmp_path / "none.npz")).setup()
-
-
 # -- bad scans, repeats --------------------------------------------------------------------------------------
 
 
@@ -258,7 +229,7 @@ def test_scans_that_tell_nothing_are_named_and_survived(points: NDArray[np.float
     played = run(given)
     assert texts(played)[7].startswith("adrift: odometry predicted: 0 usable points")
     assert texts(played)[-1].startswith("mapped")
-    assert errors(played["pose"], poses, poses[0])[-1] < 0.03
+    assert errors_in_map(played["pose"], poses, poses[0])[-1] < 0.03
 
 
 def test_nothing_but_empty_scans_gives_no_pose() -> None:
@@ -268,45 +239,21 @@ def test_nothing_but_empty_scans_gives_no_pose() -> None:
     assert played["pose"] == played["odometry"] == played["map"] == []
 
 
-def test_the_same_scans_give_the_same_bytes(around: Played) -> None:
-    assert run(clouds(on_round(ROUND + 5))).digests() == around.digests()
+@pytest.mark.long
+def test_restored_operator_resumes_alike() -> None:
+    assert_resumes_alike(lambda: LidarSlam(**NEAR), [(cloud,) for cloud in clouds(on_round(ROUND + 4))], ROUND - 3)
 
 
 @pytest.mark.long
-def test_a_restored_state_goes_on_alike() -> None:
-    given = clouds(on_round(ROUND + 4))
-    one, other = LidarSlam(**NEAR), LidarSlam(**NEAR)  # type: ignore[arg-type]
-    one.setup()
-    other.setup()
-    for cloud in given[: ROUND - 3]:
-        one.process(cloud)
-    recorded = pack_state(one.snapshot())
-    other.restore(unpack_state(recorded))
-    assert pack_state(other.snapshot()) == recorded
-    for cloud in given[ROUND - 3 :]:
-        sent, again = one.process(cloud), other.process(cloud)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+def test_operator_restored_while_a_saved_map_is_searched_resumes_alike(saved: Path) -> None:
+    firings = [(cloud,) for cloud in clouds(elsewhere(12), first=60)]
 
+    def make() -> LidarSlam:
+        return LidarSlam(map_file=str(saved), **NEAR)
 
-@pytest.mark.long
-def test_a_state_that_is_restored_while_a_saved_map_is_searched_goes_on_alike(saved: Path) -> None:
-    given = clouds(elsewhere(12), first=60)
-    one, other = (LidarSlam(map_file=str(saved), **NEAR) for _ in range(2))  # type: ignore[arg-type]
-    one.setup()
-    other.setup()
-    seen_again = 0
-    for k, cloud in enumerate(given):
-        search = one.state.mapper.graph.search
-        if search is not None and search.sights:
-            recorded = pack_state(one.snapshot())
-            other.restore(unpack_state(recorded))
-            assert pack_state(other.snapshot()) == recorded
-            seen_again = k
-            break
-        one.process(cloud)
-    assert seen_again
-    for cloud in given[seen_again:]:
-        sent, again = one.process(cloud), other.process(cloud)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+    probe, searching = make(), 0
+    probe.setup()
+    while not (probe.state.mapper.graph.search and probe.state.mapper.graph.search.sights):
+        probe.process(*firings[searching])
+        searching += 1
+    assert_resumes_alike(make, firings, searching)

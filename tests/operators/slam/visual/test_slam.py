@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from operator_runs import assert_one_calibration, assert_resumes_alike, errors_in_map, texts
 
-from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
-from dataflow.messages.geometry import invert
 from dataflow.testing import Played, play
-from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry import VisualOdometry
 from operators.slam import VisualSlam
@@ -64,7 +62,7 @@ def info(name: str, error: float = 0.0) -> CameraInfo:
     return CameraInfo(stamp=0, frame=name, width=SIZE[0], height=SIZE[1], K=wrong)
 
 
-def streams(seen: Sequence[Frame], focal_error: float = 0.0) -> dict[str, list]:  # type: ignore[type-arg]
+def streams(seen: Sequence[Frame], focal_error: float = 0.0) -> dict[str, list]:
     stamps = [100_000_000 * k for k in range(len(seen))]
     return {
         "image": [Image(stamp=t, frame="color", data=image) for t, (image, _) in zip(stamps, seen, strict=True)],
@@ -79,17 +77,6 @@ STATIC = ("image_info", "depth_info")
 
 def run(seen: Sequence[Frame], focal_error: float = 0.0, **params: object) -> Played:
     return play(VisualSlam(**params), streams(seen, focal_error), static=STATIC)
-
-
-def errors(poses: Sequence, truth: Sequence[Matrix], origin: Matrix) -> NDArray[np.float64]:  # type: ignore[type-arg]
-    """Distance (m) of poses in the map from the truth, where the map's origin is known; no alignment."""
-    return np.array(
-        [np.linalg.norm((origin @ p.matrix())[:3, 3] - T[:3, 3]) for p, T in zip(poses, truth, strict=True)]
-    )
-
-
-def texts(played: Played) -> list[str]:
-    return [status.messages[0] for status in played["status"]]
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +109,14 @@ def test_a_loop_takes_drift_away() -> None:
     poses = on_round(ROUND + 10)
     played = run(frames(poses), focal_error=0.015)
     assert any(text.startswith("corrected") for text in texts(played))
-    corrected = errors(played["pose"], poses, poses[0])
-    drifted = errors(played["odometry"], poses, poses[0])
+    corrected = errors_in_map(played["pose"], poses, poses[0])
+    drifted = errors_in_map(played["odometry"], poses, poses[0])
     # Back at the start the map is known exactly: it was begun there.
     assert drifted[ROUND] > 0.03
     assert corrected[ROUND + 5] < 0.5 * drifted[ROUND + 5]
     assert len(played["path"]) > 0
     stamps = {pose.stamp for pose in played["pose"]}
     for path in played["path"]:
-        assert path.stamps is not None
         assert set(path.stamps.tolist()) <= stamps
         assert path.stamps[-1] <= path.stamp
     assert len(played["map"]) > 0
@@ -149,7 +135,7 @@ def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
     played = run(frames(poses), map_file=str(saved))
     assert "corrected: the map is found" in texts(played)
     assert len(played["pose"]) >= 5
-    found = errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0])
+    found = errors_in_map(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0])
     assert found.max() < 0.05
 
 
@@ -202,27 +188,8 @@ def test_a_floor_that_repeats_is_no_place_to_be_found_at(tmp_path: Path) -> None
     assert {text.split(":")[0] for text in texts(tried)} == {"searching"}
 
 
-@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_map_is_refused(tmp_path: Path, content: bytes) -> None:
-    file = tmp_path / "wrong.npz"
-    file.write_bytes(content)
-    with pytest.raises(ValueError, match="is no visual map"):
-        read_visual_map(file)
-
-
-def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "new.npz", version=np.array(99))
-    with pytest.raises(ValueError, match="version 99"):
-        read_visual_map(tmp_path / "new.npz")
-    np.savez(tmp_path / "cut.npz", version=np.array(1))
-    with pytest.raises(ValueError, match="damaged"):
-        read_visual_map(tmp_path / "cut.npz")
-    with pytest.raises(FileNotFoundError):
-        VisualSlam(map_file=str(tmp_path / "none.npz")).setup()
-
-
 @pytest.mark.long
-def test_blind_frames_are_told_and_survived() -> None:
+def test_blind_frames_are_reported_and_bridged() -> None:
     poses = on_round(24)
     seen = frames(poses)
     dark = [(np.zeros_like(i), np.full_like(d, np.nan)) if 12 <= k < 15 else (i, d) for k, (i, d) in enumerate(seen)]
@@ -230,44 +197,22 @@ def test_blind_frames_are_told_and_survived() -> None:
     told = texts(played)
     assert all(text.startswith("adrift: odometry") for text in told[12:15])
     assert told[-1].startswith(("mapped", "corrected"))
-    assert errors(played["pose"], poses, poses[0])[-1] < 0.05
+    assert errors_in_map(played["pose"], poses, poses[0])[-1] < 0.05
 
 
 @pytest.mark.long
-def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
-    once = streams(frames(on_round(8)))
-    stamps = [image.stamp for image in once["image"]]
-    each = once | {name: [once[name][0].replace(stamp=stamp) for stamp in stamps] for name in STATIC}
-    assert play(VisualSlam(), each).digests() == play(VisualSlam(), once, static=STATIC).digests()
-    each["image_info"][5] = info("color", 0.1).replace(stamp=stamps[5])
-    with pytest.raises(Exception, match="the calibration changed"):
-        play(VisualSlam(), each)
+def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
+    assert_one_calibration(
+        VisualSlam, streams(frames(on_round(8))), STATIC[::-1], "image", info("color", 0.1), 5
+    )  # fmt: skip
 
 
 @pytest.mark.long
-def test_the_same_frames_give_the_same_bytes(around: Played) -> None:
-    assert run(frames(on_round(ROUND + 6))).digests() == around.digests()
-
-
-@pytest.mark.long
-def test_a_restored_state_goes_on_alike() -> None:
-    seen = frames(on_round(ROUND + 4))
-    given = streams(seen)
-    one, other = VisualSlam(), VisualSlam()
-    one.setup()
-    other.setup()
-    other.restore(unpack_state(pack_state(one.snapshot())))  # of no frame
-    calibration = (given["image_info"][0], given["depth_info"][0])
-    for k in range(ROUND - 4):
-        one.process(given["image"][k], given["depth"][k], *calibration)
-    recorded = pack_state(one.snapshot())
-    other.restore(unpack_state(recorded))
-    assert pack_state(other.snapshot()) == recorded
-    for k in range(ROUND - 4, ROUND + 4):
-        sent = one.process(given["image"][k], given["depth"][k], *calibration)
-        again = other.process(given["image"][k], given["depth"][k], *calibration)
-        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
-    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+def test_restored_operator_resumes_alike() -> None:
+    given = streams(frames(on_round(ROUND + 4)))
+    calibration = given["image_info"][0], given["depth_info"][0]
+    firings = [(*pair, *calibration) for pair in zip(given["image"], given["depth"], strict=True)]
+    assert_resumes_alike(VisualSlam, firings, ROUND - 4)
 
 
 @pytest.mark.long
@@ -279,7 +224,3 @@ def test_covariance_covers_the_error(around: Played) -> None:
         R = poses[0][:3, :3]
         squares.append(off @ np.linalg.solve(R @ pose.pose_covariance[:3, :3] @ R.T, off) / 3)
     assert 0.005 < np.mean(squares) < 3.0
-
-
-def test_truth_of_the_made_path_closes() -> None:
-    assert np.abs(se3.log(invert(on_round(1)[0]) @ on_round(1, ROUND)[0])).max() < 1e-9
