@@ -6,8 +6,6 @@ import ctypes
 import importlib
 from types import ModuleType
 
-from dataflow.extras import missing_extra
-
 
 def open3d() -> ModuleType:
     """The `open3d` module. Raises ImportError with what to install."""
@@ -18,9 +16,8 @@ def open3d() -> ModuleType:
     try:
         return importlib.import_module("open3d")
     except ImportError as error:
-        hint = missing_extra(error)
-        text = f"the simulator casts rays with Open3D, which cannot be imported: {error}{'; ' if hint else ''}{hint}"
-        raise ImportError(text) from error
+        hint = "it comes with: pip install 'robot-dataflow[sim]', but not for aarch64 with Python 3.12 or newer"
+        raise ImportError(f"the simulator casts rays with Open3D, which cannot be imported: {error}; {hint}") from error
 
 
 def _load_bundled_libusb() -> None:
