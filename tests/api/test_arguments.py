@@ -165,7 +165,7 @@ def test_recordings_and_streams_name_wrong_types(recording: dataflow.RecordedStr
             call()
 
 
-def test_a_session_names_what_is_no_dictionary_of_messages() -> None:
+def test_session_put_refuses_arguments_of_wrong_type() -> None:
     with dataflow.Session(watch()) as session:
         with pytest.raises(
             TypeError, match=r"Session\.put\(\): messages: expected a dictionary from texts to Messages"

@@ -97,7 +97,7 @@ def test_elements_of_messages_without_parallel_arrays_are_refused(recording: dat
         recording["imu"].elements()
 
 
-def test_without_pandas_a_table_says_what_to_install_and_columns_work(
+def test_frame_without_pandas_names_the_extra_and_columns_still_work(
     recording: dataflow.RecordedStreams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)

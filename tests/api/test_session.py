@@ -78,7 +78,7 @@ def test_an_input_that_does_not_fit_is_refused_and_the_session_goes_on(run: data
         session.put(second.stamp + 1, {})
 
 
-def test_what_is_missing_at_the_beginning_is_named(run: dataflow.RunResult) -> None:
+def test_session_without_required_streams_names_the_missing_one(run: dataflow.RunResult) -> None:
     with pytest.raises(ValueError, match="no message for the static stream 'camera/depth_info'"):
         dataflow.Session(small(), static={k: v for k, v in statics(run).items() if "depth" not in k})
     with pytest.raises(ValueError, match="no stream 'cloud/clouds'"):

@@ -72,7 +72,7 @@ def test_a_call_leads_on_by_its_inputs_or_by_a_state_that_a_later_call_had_of_an
     assert found.loose_of([early, Call("track", 8), Call("map", 5)]) == [early, Call("track", 8), Call("map", 5)]
 
 
-def test_calls_that_count_only_by_another_content_beside_one_of_its_own_need_not_lead_on() -> None:
+def test_calls_that_count_only_by_other_content_need_no_further_link() -> None:
     nudge, other = Effect("nudged", (), 1.0), Effect("the one before", (), 1.0)
     aside, behind, own = Call("clock", 1), Call("drift", 1), Call("track", 5)
     beside = [link(TARGET, own, nudge), link(TARGET, aside, other), link(aside, behind, nudge)]

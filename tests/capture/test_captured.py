@@ -59,7 +59,7 @@ def test_a_captured_call_comes_back_from_its_file(late: Path) -> None:
         Captured.from_bytes(b"something else")
 
 
-def test_what_is_as_recorded_is_refused(late: Path) -> None:
+def test_capturing_a_call_without_error_is_refused(late: Path) -> None:
     with pytest.raises(DebugError, match="call 3 of bug: as recorded, no error"):
         captured(late, number=3)
     with pytest.raises(DebugError, match="bug has 401 calls: none for which stamp < 0"):

@@ -182,7 +182,7 @@ def test_threads_that_repeat_among_themselves_are_no_cause() -> None:
     assert found.causes == [UUID]
 
 
-def test_a_process_that_dies_of_what_is_left_free_shows_a_cause() -> None:
+def test_process_death_by_an_unfixed_source_reveals_the_cause() -> None:
     operator = Operator(())
 
     def fire(setting: Setting) -> Rerun:

@@ -46,7 +46,7 @@ def test_a_ros_1_bag_is_drawn_too(dataflow, tmp_path: Path) -> None:
     assert "3 messages" in dataflow("view", file, "--to", tmp_path / "old.rrd").stdout
 
 
-def test_a_dataset_takes_what_is_left_without_the_other_streams_of_a_kind(dataflow, bag: Path, tmp_path: Path) -> None:
+def test_converting_to_a_dataset_takes_the_streams_left_by_without(dataflow, bag: Path, tmp_path: Path) -> None:
     assert "give one with --to: mcap, ros2, foxglove" in dataflow("convert", bag, tmp_path / "a", code=2).stderr
     refused = dataflow("convert", bag, tmp_path / "a", "--to", "tum", code=2).stderr
     assert "--without all but one of /estimate, /truth" in " ".join(refused.split())
@@ -163,7 +163,7 @@ operators:
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
-def test_options_of_a_replayed_bag_choose_what_is_played(
+def test_options_of_a_replayed_bag_select_its_messages(
     dataflow, film: Path, tmp_path: Path, words: tuple[str, ...], stamps: list[float], said: str
 ) -> None:
     from dataflow.recording import Recording

@@ -114,7 +114,7 @@ def test_a_stream_that_the_graph_does_not_have_is_refused_at_once(dataflow) -> N
 
 
 @pytest.mark.usefixtures("running")
-def test_hz_knows_the_rate_by_stamp(dataflow) -> None:
+def test_hz_prints_the_rate_by_stamp(dataflow) -> None:
     rows = json.loads(dataflow("hz", "left/fast", "--seconds", 0.5, "--json").stdout)
     (row,) = rows
     assert row["stream"] == "test/left/fast"

@@ -169,9 +169,7 @@ def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_ask
     assert asked == "1" or told.stderr.splitlines()[1:] == ["where in the code: run it again with DATAFLOW_TRACEBACK=1"]
 
 
-def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_is_left(
-    dataflow, small: Path, tmp_path: Path
-) -> None:
+def test_failing_operator_ends_the_run_with_traceback_and_recording(dataflow, small: Path, tmp_path: Path) -> None:
     path = tmp_path / "failed.mcap"
 
     told = dataflow("run", small, "--set", "at=20", "--one-process", "--record", path, code=1)

@@ -321,7 +321,7 @@ def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Pat
     assert list(told["lost"]["/good"].values()) == [1]
 
 
-def test_a_replay_of_a_damaged_file_counts_what_is_lost_in_words_and_in_json(dataflow, tmp_path: Path) -> None:
+def test_replay_of_a_damaged_file_counts_losses_in_text_and_json(dataflow, tmp_path: Path) -> None:
     path, graph = damaged_chunk(tmp_path / "a.mcap"), tmp_path / "g.yaml"
     graph.write_text(GRAPH)
     words = ("replay", path, "--graph", graph, "--one-process")

@@ -206,7 +206,7 @@ def test_streams_are_those_of_the_operator_that_makes_them() -> None:
     assert math.isnan(one[0]["figures"]["error"])
 
 
-def test_streams_are_told_apart_where_a_namespace_ends_as_an_operator_begins() -> None:
+def test_streams_are_distinct_where_namespace_and_operator_share_a_name() -> None:
     counts = {"firings": 1, "emitted": 1, "dropped": 0, "cpu_ms": 1.0, "wall_ms": 1.0}
     run = {"operators": {"x": counts, "ns/x": counts}, "restarts": {}, "summaries": {}}
 

@@ -260,7 +260,7 @@ def test_top_reports_latency_of_every_path(dataflow) -> None:
 
 
 @pytest.mark.usefixtures("running")
-def test_health_names_what_is_wrong_and_has_an_exit_code_for_it(dataflow, tmp_path: Path) -> None:
+def test_unhealthy_graph_is_reported_with_reasons_and_exit_code(dataflow, tmp_path: Path) -> None:
     words = ["health", "--over", "0.5", "--free", "0", "--folder", tmp_path]
     assert dataflow(*words, "--losses", "1").stdout == "tunable is healthy: 4 operators\n"
 

@@ -62,6 +62,6 @@ def test_a_file_that_cannot_be_written_refuses() -> None:
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:4318", "file:///etc/passwd", "http://", "ftp://127.0.0.1/x"])
-def test_what_is_no_collector_is_refused(url: str) -> None:
+def test_malformed_collector_url_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match=r"no URL of a collector, such as http://127.0.0.1:4318/v1/traces"):
         to_collector(url)

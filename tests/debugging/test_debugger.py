@@ -617,7 +617,7 @@ def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> No
     assert fired.recorded_error is None
 
 
-def test_setup_that_fails_is_tried_anew(added: Recording, tmp_path: Path) -> None:
+def test_failed_setup_is_retried(added: Recording, tmp_path: Path) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(2)
     written(tmp_path, RIGHT, more_imports="def broken(self): raise OSError('no camera')")

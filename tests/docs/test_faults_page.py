@@ -14,10 +14,10 @@ from dataflow.graph import load_graph
 from dataflow.supervision.core.health import LEVELS
 
 SHOWN_BY = {
-    "an operator raises": "an_operator_that_raises_is_made_anew_in_the_same_process",
+    "an operator raises": "operator_that_raises_is_recreated_in_the_same_process",
     "a process crashes": """
         a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on
-        a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost
+        frontier_from_a_successor_reveals_messages_lost_of_its_predecessor
         a_late_death_notice_does_not_affect_the_successor
     """,
     "the same operator fails again and again": "restarts_come_to_an_end_and_the_last_cause_is_named",
@@ -44,7 +44,7 @@ SHOWN_BY = {
         what_did_not_reach_a_consumer_is_counted_against_it
     """,
     "a process lives and takes no messages (a call that holds the interpreter)": """
-        a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted
+        stopped_consumer_delays_no_other_process_and_its_loss_is_counted
     """,
     "the whole run or its supervisor pauses (`docker pause`, a suspended laptop, heavy swapping)": """
         pause_of_supervisor_and_others_kills_and_blames_no_process
@@ -56,7 +56,7 @@ SHOWN_BY = {
     "several faults at random": "a_run_under_faults_of_every_kind_is_verified_in_the_other_placement",
     "a source crashes, or a live source raises (an unplugged camera)": """
         a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is
-        a_source_that_raises_is_made_anew_in_the_same_process
+        source_that_raises_is_recreated_in_the_same_process
     """,
     "a source stops": """
         a_source_that_stops_is_an_event_in_the_diagnostics
@@ -69,7 +69,7 @@ SHOWN_BY = {
     """,
     "a source floods": "a_flood_is_dropped_where_it_is_too_much_and_counted",
     "a clock jumps back": """
-        a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told
+        clock_jump_back_starts_an_incarnation_and_resets_operators
         a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
     """,
     "a clock jumps ahead": """

@@ -272,7 +272,7 @@ def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> N
         place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
 
 
-def test_a_chain_that_begins_in_an_environment_and_ends_outside_is_refused_with_what_may_be_asked(
+def test_chain_leaving_its_environment_is_refused_with_the_askable_part(
     environments: Path,
 ) -> None:
     text = TEXT.format(folder=environments, record="all").replace(f", env: {environments}/two", "")

@@ -124,7 +124,7 @@ IMAGES = [Image(stamp=t, frame="c", data=np.zeros((2, 2), np.uint8)) for t in (5
         (Closing(), {"number": [Number(stamp=1, value=0)]}, r"finish\(\) has no anchor"),
     ],
 )
-def test_a_frame_that_nothing_gives_is_an_error_that_says_why(
+def test_undeterminable_frame_is_an_error_with_its_reason(
     operator: Operator, streams: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(OperatorFailure, match=rf"emitted Point without frame, and .*{why}.*; give frame="):

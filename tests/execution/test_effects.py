@@ -342,7 +342,7 @@ GRID = np.arange(6, dtype=np.float32).reshape(2, 3)
 @pytest.mark.parametrize(
     "other", [GRID.reshape(3, 2), GRID.astype(np.float64), GRID.T.copy(), GRID + 1, GRID.tolist(), GRID[:0]]
 )
-def test_arrays_are_told_apart_by_type_shape_and_values(other: Any) -> None:
+def test_array_keys_differ_by_type_shape_and_values(other: Any) -> None:
     def key(value: Any) -> Key:
         return Key.of(ask, (value,), {})
 

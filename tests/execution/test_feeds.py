@@ -18,7 +18,7 @@ from dataflow.recording import Recorded
 from dataflow.sync import FOREVER, Entry
 
 
-def test_a_window_is_full_by_messages_or_bytes_and_empties_with_what_is_done() -> None:
+def test_window_fills_by_messages_or_bytes_and_empties_when_covered() -> None:
     window = Window(3, 100)
     window.add(1, 2, 10)
     assert not window.full
@@ -171,7 +171,7 @@ def test_a_feed_that_is_ended_early_ends_its_streams_where_it_was() -> None:
     assert [(r.kind, r.operator) for r in told.records if r.kind == "finish"] == [("finish", "m"), ("finish", "s")]
 
 
-def test_a_stream_whose_clock_went_back_ends_behind_its_last_message_though_it_was_further_before() -> None:
+def test_stream_whose_clock_went_back_ends_after_its_last_message() -> None:
     log, told = feed(Played((X, 50, 0), (X, 10, 1), (Y, 60, 0), (X, 70, 1), static=MAP))
 
     given_whole(log)

@@ -176,7 +176,7 @@ def test_an_operator_that_never_fires_keeps_a_bounded_number_of_drops() -> None:
     assert more == {("a", "overflow"): 9_999 - 4_096}
 
 
-def test_a_record_says_how_many_drops_it_does_not_list() -> None:
+def test_record_counts_its_unlisted_drops() -> None:
     runner, collector = live(node(Echo, {"x": ["t/s/x"]}, Live("newest", 1, {"x": 0})))
 
     for seq in range(5_000):

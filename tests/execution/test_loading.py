@@ -161,7 +161,7 @@ def test_a_module_that_fails_to_load_leaves_the_generators_as_they_were(modules:
     assert made(draws) == made(random.random)
 
 
-def test_what_is_loaded_outside_of_calls_is_left_alone(modules: Path) -> None:
+def test_modules_imported_outside_of_calls_are_left_alone(modules: Path) -> None:
     made(random.random)
     random.seed(5)
     import drawing  # noqa: F401

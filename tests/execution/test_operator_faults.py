@@ -39,7 +39,7 @@ class Crashing(Echo):
         return x
 
 
-def test_a_failure_that_is_outlived_says_the_operators_own_line() -> None:
+def test_survived_failure_names_the_line_of_the_operator() -> None:
     made = node(Crashing, {"x": ["t/s/x"]}, Live("newest", 16, {"x": 0}, restart=Restart(max=1, backoff=0)))
     told: list[OperatorFailure] = []
     runner = LiveRunner(

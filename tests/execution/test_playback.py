@@ -91,7 +91,7 @@ def test_an_unknown_action_is_refused() -> None:
         (b"x n", ["toggle", "step"]),
     ],
 )
-def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
+def test_keys_match_the_help_text(typed: bytes, meant: list[str]) -> None:
     assert list(pressed(typed)) == meant
 
 

@@ -173,7 +173,7 @@ def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
     assert not store().exists()
 
 
-def test_a_reload_says_whether_the_code_has_changed(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
+def test_reload_reports_whether_the_code_changed(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
     runner, _ = running
     assert not runner.reload()["changed"]
     (folder / "step_of_reload.py").write_text("STEP = 20\n")
@@ -192,9 +192,7 @@ def test_a_module_that_declares_messages_is_not_imported_again(
         runner.reload()
 
 
-def test_a_state_that_the_new_code_does_not_take_is_begun_anew(
-    folder: Path, running: tuple[LiveRunner, Collector]
-) -> None:
+def test_state_unfit_for_reloaded_code_is_reset(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
     runner, collector = running
     (folder / "sum_to_reload.py").write_text(CODE.replace("total", "sum_so_far"))
 

@@ -436,7 +436,7 @@ def test_fault_of_a_text_with_a_setting_in_it_stays_where_the_text_is() -> None:
     assert str(problem).startswith("graph.yaml:4:17: module 'graph_operators' has no operator 'Camra'")
 
 
-def test_fault_of_a_graph_parameter_tells_where_its_value_is_given() -> None:
+def test_graph_parameter_error_points_to_where_its_value_is_given() -> None:
     text = GIVEN.replace("rate: 30", "rate: -3")
     (problem,) = problems(text)
 

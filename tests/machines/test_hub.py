@@ -24,7 +24,7 @@ def test_an_agent_without_a_run_is_offered_one_and_another_of_its_name_gets_noth
     assert claims.answer("arm", b"3", "former", None, 0.0) == "busy"
 
 
-def test_an_agent_that_left_the_run_or_was_started_anew_is_noticed() -> None:
+def test_agent_that_left_the_run_or_restarted_is_detected() -> None:
     claims = Claims("run")
     claims.answer("robot", b"1", "", None, 0.0)
     assert claims.answer("robot", b"1", "run", LONG, 40.0) == ""  # a long stall: it goes on

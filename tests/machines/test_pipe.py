@@ -166,9 +166,7 @@ class SlowLink:
 
 @pytest.mark.parametrize("delay", [0.002, 0.3])
 @pytest.mark.parametrize("rate", [125e3, 1e6, 20e6])
-def test_a_slow_link_is_used_up_and_what_is_on_it_delays_a_beat_by_less_than_a_silence(
-    rate: float, delay: float
-) -> None:
+def test_saturated_slow_link_delays_heartbeats_below_the_timeout(rate: float, delay: float) -> None:
     link = SlowLink(rate, delay)
 
     assert link.go(20) < pipes.AWAY_AFTER

@@ -157,7 +157,7 @@ def test_a_run_in_processes_verifies_and_a_changed_program_is_named(
         ("half", r"python\S* ended with exit code 3 in process\(\) at 7"),
     ],
 )
-def test_what_is_no_reply_ends_the_program(fault: str, text: str) -> None:
+def test_malformed_reply_ends_the_program(fault: str, text: str) -> None:
     with started(faulty(fault)()) as operator, pytest.raises(ProgramError, match=text):
         call(operator, 7, number=number(7))
 

@@ -39,7 +39,7 @@ def test_a_new_black_box_is_empty(memory: int) -> None:
     assert read_black_box(memory, PORTS).reached == {"camera": Reached(), "detector": Reached()}
 
 
-def test_what_is_written_is_read_by_operator(memory: int) -> None:
+def test_black_box_records_are_read_back_by_operator(memory: int) -> None:
     box = BlackBox(memory, PORTS)
     for index in range(5):
         box.add(record(index))

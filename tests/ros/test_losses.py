@@ -33,7 +33,7 @@ def test_publishers_are_counted_apart_and_a_restart_is_a_new_one() -> None:
     assert losses.publishers[OTHER].lost == losses.lost == 1
 
 
-def test_a_publisher_that_begins_anew_under_its_old_gid_has_lost_nothing() -> None:
+def test_publisher_restarted_with_its_gid_has_lost_nothing() -> None:
     losses = Losses()
     losses.take(sent(50))
     assert [losses.take(sent(n, start=10**9)) for n in (1, 2, 4)] == [0, 0, 1]

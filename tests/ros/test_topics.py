@@ -232,7 +232,7 @@ def test_definitions_are_read_before_messages_come(endpoint: str, monkeypatch: p
     assert read == [("std_msgs/msg/String", STRING), ("", "subscribed")]
 
 
-def test_errors_name_what_is_missing(endpoint: str, peer: Peer) -> None:
+def test_errors_name_the_missing_publisher_type_or_message(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
     with pytest.raises(SourceError, match=r"no publisher of /scan in domain 0 within 0.2 s; topics there: .*/chatter"):
         topics.LaserScan(topic="/scan", router=endpoint, within="200ms").setup()

@@ -78,7 +78,7 @@ def test_what_the_other_side_publishes_comes_and_its_losses_are_counted(endpoint
     talker.close()
 
 
-def test_what_is_published_here_comes_to_the_other_side(endpoint: dict[str, Any]) -> None:
+def test_published_messages_arrive_at_the_ros2_subscriber(endpoint: dict[str, Any]) -> None:
     said, seen = list[Any](), list[Any]()
     chatter = sdk.ROS2Subscriber("/chatter", STRING, said.append, "string data\n", **endpoint["there"])
     images = sdk.ROS2Subscriber("/camera", IMAGE, seen.append, **endpoint["there"])

@@ -117,7 +117,7 @@ def _recording_sensors_only(graph: Graph) -> Graph:
 
 
 @pytest.mark.long
-def test_code_that_changed_since_completes_nothing_and_says_where(live: Path, tmp_path: Path) -> None:
+def test_changed_code_completes_nothing_and_names_the_operator(live: Path, tmp_path: Path) -> None:
     graph = load_graph(HERE / "live.yaml", live=True)
     smooth = graph.nodes["smooth"]
     changed = replace(graph, nodes={**graph.nodes, "smooth": replace(smooth, use="runtime_operators:SmoothChanged")})
@@ -144,7 +144,7 @@ def test_lines_of_the_log_that_came_in_one_call_are_taken_over(live: Path, tmp_p
         assert list(a.logs()) == list(b.logs())
 
 
-def test_what_is_not_to_be_had_is_not_made_up(live: Path, tmp_path: Path) -> None:
+def test_unavailable_streams_are_not_completed(live: Path, tmp_path: Path) -> None:
     short = thin(live, tmp_path / "short.mcap", keep=0.5)
 
     made = complete(short, tmp_path / "out.mcap")

@@ -133,7 +133,7 @@ def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(p
 
 
 @pytest.mark.long
-def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+def test_operator_that_raises_is_recreated_in_the_same_process(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 
     assert ran.report.restarts == {"smooth": 1}
@@ -348,7 +348,7 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
 
 
 @pytest.mark.long
-def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
+def test_source_slower_than_the_clock_is_reported_at_once_and_at_the_end(path: Path) -> None:
     graph = graph_of(
         "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
         "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
@@ -362,7 +362,7 @@ def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Pat
     assert "s behind the clock at the end" in ran.report.notes[-1]
 
 
-def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:
+def test_clock_jump_back_starts_an_incarnation_and_resets_operators(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
     ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "300ms", "at": "500ms"})
@@ -432,7 +432,7 @@ def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+def test_source_that_raises_is_recreated_in_the_same_process(path: Path) -> None:
     graph = graph_of(
         f"camera: {{use: faulty_operators:Camera, live: {{{AGAIN}}}}}",
         "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}",

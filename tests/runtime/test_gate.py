@@ -156,7 +156,7 @@ def test_what_was_accepted_passes_and_only_that() -> None:
     assert verdicts(judge(other, known))["b"] == "culprit"
 
 
-def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_differ_from_the_recording() -> None:
+def test_new_change_downstream_of_an_accepted_one_is_a_culprit() -> None:
     known = accepted({"a": None, "b": "x", "c": "y"})
 
     found = judge(report({"a": None, "b": "x", "c": "new"}, CHAIN, culprits={"b"}), known)
@@ -231,7 +231,7 @@ def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(t
     assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a", "b"])
 
 
-def test_what_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
+def test_unrepeatable_operator_is_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x"}, {})
     made = replace(made, repeated={"a": False})
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))

@@ -140,9 +140,7 @@ def test_large_messages_arrive_whole(mixed: Graph) -> None:
 
 
 @pytest.mark.long
-def test_operators_of_nested_graphs_run_in_processes_of_their_own_and_are_seen_by_tools(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_operators_of_nested_graphs_run_in_separate_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     graph = load_graph(HERE / "outer.yaml")
 

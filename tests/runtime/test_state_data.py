@@ -228,7 +228,7 @@ def test_room_for_growth_is_not_part_of_a_snapshot() -> None:
     assert (back.values.tolist(), back._used) == ([1.0, 2.0], 2)
 
 
-def test_a_reset_begins_anew_but_for_what_is_kept() -> None:
+def test_reset_clears_all_but_the_kept_state() -> None:
     operator = Averager()
     operator.process(number(3))
 

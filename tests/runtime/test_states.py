@@ -121,7 +121,7 @@ def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
         (None, {}, "none was recorded"),
     ],
 )
-def test_what_two_states_differ_in_is_said(recorded: Any, here: Any, words: str) -> None:
+def test_differing_fields_of_two_states_are_named(recorded: Any, here: Any, words: str) -> None:
     packed = [b"" if state is None else pack_state(state) for state in (recorded, here)]
 
     assert differing_fields(packed[0], packed[1]) == words

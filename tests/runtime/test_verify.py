@@ -123,7 +123,7 @@ def test_a_torn_recording_is_never_called_wholly_identical(recorded: Path, tmp_p
         assert report.cut or report.messages == 403  # the file lacks no more than its index
 
 
-def test_a_recording_without_what_is_needed_is_refused(recorded: Path) -> None:
+def test_verifying_sources_or_unknown_operators_is_refused(recorded: Path) -> None:
     with pytest.raises(ReplayError, match="'left' cannot be verified: it is a source"):
         verify(recorded, only=["left"])
     with pytest.raises(ReplayError, match="no operator of the graph; those that can: merge, mix, smooth, sum"):

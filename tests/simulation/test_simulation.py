@@ -119,7 +119,7 @@ def test_ticks_of_the_longest_pause_are_fewer_than_the_calls_of_a_spin() -> None
     assert round(LONGEST_PAUSE / TICK) * 10 <= MOST_CALLS
 
 
-def test_what_is_deleted_makes_room_on_a_disk(tmp_path: Path) -> None:
+def test_deleting_a_file_frees_disk_space(tmp_path: Path) -> None:
     disk = Disk(World(1), tmp_path, room=100)
     descriptor = disk.open(tmp_path / "one", os.O_WRONLY | os.O_CREAT, 0o600)
     while disk.statvfs(tmp_path).f_bavail:
@@ -378,7 +378,7 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 @pytest.mark.parametrize(
     ("name", "seed"), [("part", 36), ("state", 26), ("reload", 93), ("again", 4), ("drops", 173), ("half", 11)]
 )
-def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
+def test_recording_mutants_are_detected(name: str, seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory, replay=False)
 
     with MUTANTS[name].planted(), pytest.raises(Violation):
@@ -429,7 +429,7 @@ RUN = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
 
 
 @pytest.mark.parametrize("lost", [{}, {"lost": {"messages": 1}}], ids=["not counted", "counted"])
-def test_files_in_which_nothing_is_are_those_of_a_recorder_that_counts_what_is_lost(
+def test_empty_recordings_are_accepted_only_with_counted_losses(
     lost: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As of one that was killed when it began, of which the next one found the disk full."""

@@ -126,7 +126,7 @@ def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
     assert outcome == "failed: operator 'sum' failed in close(): RuntimeError: no camera"
 
 
-def test_covered_goes_to_processes_with_sources_only_and_replaces_what_is_queued() -> None:
+def test_covered_goes_to_source_processes_only_and_replaces_the_queued_one() -> None:
     play = Play().starts()
 
     told = play.tell(play.progress("sum", {"sum": 5}), play.progress("sum", {"sum": 6}))
@@ -203,7 +203,7 @@ def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
     assert play.core.status.notes == ["the graph looks further ahead than the window: doubled to 16 messages"]
 
 
-def test_what_is_under_way_is_no_proof() -> None:
+def test_messages_in_flight_prevent_the_proof_of_completion() -> None:
     play = Play().starts()
 
     for k in range(100):
@@ -291,7 +291,7 @@ def test_a_second_ctrl_c_while_starting_does_not_wait() -> None:
     assert play.failure() == "stopped before everything was closed"
 
 
-def test_endless_draining_is_bounded_and_reports_what_is_owed() -> None:
+def test_draining_is_bounded_and_reports_the_backlog() -> None:
     play = Play(stall_timeout=30.0).starts()
     play.tell(play.progress("left", {"left": 1_800_000_000}))
     play.stops()
@@ -321,7 +321,7 @@ def test_patience_shortens_the_time_for_closing(patience: float, closes_within: 
     assert asked_where(play.commands) == ["sum"]
 
 
-def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_long_ago_is_not() -> None:
+def test_failure_details_hold_output_of_the_late_process_and_no_old_output_of_others() -> None:
     play = Play(stall_timeout=8.0).starts()
     play.deaf.add("sum")
     for label in play.processes:
@@ -381,7 +381,7 @@ def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> No
 
 
 @pytest.mark.parametrize("lost_after", [None, 5.0])
-def test_what_was_sent_and_not_received_counts_as_lost_only_after_a_while_in_which_nothing_moves(
+def test_unreceived_messages_count_as_lost_only_after_an_idle_period(
     lost_after: float | None,
 ) -> None:
     proof = Proof(lost_after)

@@ -454,7 +454,7 @@ def test_a_source_whose_stamps_jumped_far_ahead_is_named() -> None:
     ]
 
 
-def test_planned_faults_happen_at_their_time_and_what_is_frozen_thaws() -> None:
+def test_planned_faults_occur_on_time_and_frozen_processes_thaw() -> None:
     freeze, kill = Fault(0.5, "freeze", "smooth", {"span": 0.3}), Fault(2.0, "kill", "left", {})
     play = robot(faults=iter([freeze, kill, Fault(9.0, "raise", "smooth", {})])).starts()
 
@@ -608,7 +608,7 @@ def test_what_an_operator_did_before_its_restarts_counts_with_what_it_does_now()
     assert status.waits["smooth"] == {("x", "timeout"): 8}
 
 
-def test_operators_that_are_made_anew_within_their_process_are_counted() -> None:
+def test_operators_recreated_within_their_process_are_counted() -> None:
     play = robot().starts()
     failed = {"when": "fire at stamp 5", "summary": "x", "pause": 0.5, "where": "", "traceback": ""}
     for name in ("smooth", "after", "smooth"):

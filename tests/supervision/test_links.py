@@ -51,7 +51,7 @@ def test_a_recorder_is_linked_to_every_process_also_for_its_firing_records() -> 
     }
 
 
-def test_a_process_sends_to_the_recorder_first_so_that_what_others_took_is_recorded_whenever_it_is_killed() -> None:
+def test_process_sends_to_the_recorder_before_other_consumers() -> None:
     made = plan(record=Path("run.mcap"))
     takers = [consumer for producer, consumer in pairs_of(made.graph, process_plans(made)) if producer == "left"]
     assert takers == ["@recorder", "smooth"]

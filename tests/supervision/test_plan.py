@@ -123,7 +123,7 @@ def test_a_recording_takes_the_place_of_what_made_its_streams() -> None:
     assert (one["all"].nodes, one["all"].has_log) == (("smooth", "sum", "other"), True)
 
 
-def test_streams_of_an_operator_in_the_middle_leave_what_is_before_it_to_run_for_others() -> None:
+def test_log_of_an_inner_operator_keeps_its_upstream_for_others() -> None:
     middle = plans(log=LogPlan(Path("run.mcap"), (MEAN,)))
     assert middle["left"].publish == {FAST: 1}  # to `other` alone
     assert middle["@log"].publish == {MEAN: 1}

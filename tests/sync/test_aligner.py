@@ -78,7 +78,7 @@ def test_a_sampled_input_is_cut_at_its_delay_and_known_as_soon_as_its_frontier_i
     assert seen(poll_all(aligner)) == [(10, {"a": 10, "x": taken})]
 
 
-def test_a_required_sample_that_is_missing_or_stale_drops_the_trigger_and_says_why() -> None:
+def test_missing_or_stale_required_sample_drops_the_trigger_with_reason() -> None:
     aligner = Aligner(AlignSpec((A,), (SampledSpec("x", ("x",), max_age=5),)))
     aligner.advance("x", 1)
     push(aligner, "a", 1, 7, 8)

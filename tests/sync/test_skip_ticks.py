@@ -37,7 +37,7 @@ def test_a_message_between_them_still_fires_and_one_on_the_grid_fires_without_it
     assert [(f.stamp, f.tick) for f in poll_all(aligner)][:4] == [(1, False), (30, False), (45, False), (80, True)]
 
 
-def test_only_ticks_that_are_known_to_be_there_are_left_out() -> None:
+def test_only_ticks_known_to_be_due_are_skipped() -> None:
     aligner = told(1, 32)
 
     aligner.skip_ticks(1000)

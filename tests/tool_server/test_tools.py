@@ -402,7 +402,7 @@ class Onwards(Chance):
 
 
 @pytest.mark.parametrize("shares", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_an_operator_that_did_not_repeat_before_the_fix_is_named_and_only_judged_where_it_may_be_changed(
+def test_unrepeatable_operator_is_named_and_judged_only_if_its_code_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shares: bool
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -27,7 +27,7 @@ from dataflow.transport.network import is_local
 DEPTH = "robot1/camera/depth"
 
 
-def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
+def test_plain_subscriber_receives_all_messages_in_order(
     pair: tuple[Bus, Bus], eventually: Callable[..., None]
 ) -> None:
     first, second = pair
@@ -43,7 +43,7 @@ def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
     assert first.counters()["published_messages"] == len(sent)
 
 
-def test_publisher_knows_whether_it_has_subscribers(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
+def test_publisher_reports_whether_it_has_subscribers(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
     first, second = pair
     publisher = first.publisher(DEPTH)
     assert not publisher.matched

@@ -137,7 +137,7 @@ def test_arrays_outlive_the_pool_and_new_ones_are_made_elsewhere() -> None:
         make_large_arrays_in(None)
 
 
-def test_a_child_makes_arrays_in_memory_of_its_own(pool: SharedPool) -> None:
+def test_forked_child_allocates_arrays_outside_the_pool(pool: SharedPool) -> None:
     """It would write where its parent does."""
     child = os.fork()
     if child == 0:

@@ -107,7 +107,7 @@ def test_without_room_messages_travel_whole_and_are_counted(shared: Shared) -> N
     assert shared.fanout.counters()["shared_messages"] == 5
 
 
-def test_unheld_pool_is_cut_anew_for_another_size(shared: Shared) -> None:
+def test_unheld_pool_is_resized_for_other_messages(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     held.clear()
     assert shared.passed(9, 512) == depth_image(9, 512)  # 1 MB: fits only where all four were

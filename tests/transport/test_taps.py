@@ -86,7 +86,7 @@ def test_beyond_the_window_the_newest_message_of_each_stream_waits(
         assert client.refused == 0
 
 
-def test_a_window_in_bytes_bounds_what_is_under_way_but_lets_one_message_pass(
+def test_byte_window_bounds_messages_in_flight_but_admits_one(
     pair: tuple[Bus, Bus], server: TapServer, eventually: Callable[..., None]
 ) -> None:
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(bytes=1000)) as client:

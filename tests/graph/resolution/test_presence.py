@@ -152,7 +152,7 @@ operators:
     assert "part/odometry" in load_text(text, files={"part.yaml": PART}, settings=["more=true"]).nodes
 
 
-def test_what_is_left_out_is_the_same_from_a_bundle_and_from_json() -> None:
+def test_left_out_operators_survive_bundle_and_json() -> None:
     graph = outer("")
     again = load_bundle(graph.bundle())
     assert again.left_out == graph.left_out

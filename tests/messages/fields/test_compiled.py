@@ -136,7 +136,7 @@ def test_equal_symbols_mean_equal_extents() -> None:
         assert outcome(Pair, {"stamp": 1, **arrays}) == expected, shapes
 
 
-def test_what_is_given_stays_the_givers() -> None:
+def test_message_copies_its_arrays() -> None:
     given_array = np.ones((2, 1))
     message = Large(stamp=1, first=np.zeros(2, np.uint8), third=given_array)
     given_array[:] = 5

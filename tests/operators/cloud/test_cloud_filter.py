@@ -44,7 +44,7 @@ def test_range_and_box_keep_what_lies_in_them() -> None:
     assert counts["kept"] == "2"
 
 
-def test_a_voxel_has_the_mean_of_its_points_and_of_what_is_known_of_them() -> None:
+def test_voxel_holds_the_means_of_points_colors_and_intensities() -> None:
     points = [[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1]]
     given_cloud = cloud(
         points,

@@ -126,7 +126,7 @@ def test_nanodet_as_its_head_in_torch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["float32", "float16"])
-def test_rtdetr_gives_the_boxes_of_its_own_postprocessor(tmp_path: Path, kind: str) -> None:
+def test_rtdetr_boxes_match_its_reference_postprocessor(tmp_path: Path, kind: str) -> None:
     """`bbox_pred *= orig_target_sizes.repeat(1, 2)`: pixels of the size that it is given, width first."""
     rng = np.random.default_rng(3)
     low, extent = rng.uniform(0, 0.6, (1, 9, 2)), rng.uniform(0.1, 0.3, (1, 9, 2))

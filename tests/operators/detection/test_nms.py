@@ -44,7 +44,7 @@ def test_the_order_of_the_boxes_does_not_matter_even_with_ties(seed: int, count:
 
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, COUNTS, THRESHOLDS)
-def test_what_is_kept_does_not_overlap_and_what_is_dropped_does(seed: int, count: int, threshold: float) -> None:
+def test_kept_boxes_do_not_overlap_and_dropped_ones_do(seed: int, count: int, threshold: float) -> None:
     boxes, scores, classes = random_boxes(seed, count)
     kept = class_wise_nms(boxes, scores, classes, threshold).tolist()
     for i in range(count):

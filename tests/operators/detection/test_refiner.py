@@ -106,7 +106,7 @@ def again(file: Path, pixels: NDArray[np.uint8], found: Candidates) -> Candidate
 # ---- what it sees
 
 
-def test_a_closeup_shows_what_is_in_its_window() -> None:
+def test_closeup_shows_the_pixels_of_its_window() -> None:
     pixels = np.zeros((60, 100, 3), np.uint8)
     pixels[20:40, 30:50] = (255, 128, 0)
     whole = closeups(pixels, np.array([[20, 10, 60, 50]], np.float32), 40)[0]
@@ -336,7 +336,7 @@ def test_a_box_is_of_the_object_of_its_class_that_it_overlaps_most() -> None:
     assert np.array_equal(wanted[:2], truth[:2])
 
 
-def test_what_is_learned_from_shows_the_objects_mirrored_or_not(refined: Refined) -> None:
+def test_training_closeups_show_the_objects_mirrored_or_not(refined: Refined) -> None:
     plain, _, data = refined
     task = RefinerTask(data, plain, variation=GENTLE)
     red = left = 0

@@ -61,7 +61,7 @@ def scored(
     return dict(metrics.summary())
 
 
-def test_a_right_graph_in_a_frame_of_its_own_scores_one() -> None:
+def test_right_graph_in_another_frame_scores_one() -> None:
     figures = scored([(7, "table", TABLE[2], TABLE[3]), (8, "box", BOX[2], BOX[3])], [(8, "on", 7)], offset=3.0)
     assert figures == {
         "graphs": 6,

@@ -121,7 +121,7 @@ def test_without_alignment_an_offset_is_an_error() -> None:
     assert score(moved, path)["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_pose_is_scored_against_the_truth_of_its_own_stamp() -> None:
+def test_pose_is_scored_against_the_truth_of_the_same_stamp() -> None:
     """Truth at 100 Hz and batches that come late: neither the denser nor the delayed truth confuses the pairing."""
     path = circle(1001)
     dense = [truth(T, 0, i * STEP // 10) for i, T in enumerate(path)]

@@ -195,7 +195,7 @@ def transform(t: float) -> Array:
     return T
 
 
-def test_what_is_ignored_is_counted_with_its_reason() -> None:
+def test_ignored_measurements_are_counted_by_reason() -> None:
     robot = Robot(3.0)
     fixes = robot.fixes()
     stamp = fixes[-1].stamp
@@ -218,7 +218,7 @@ def test_what_is_ignored_is_counted_with_its_reason() -> None:
     assert "robot/fix" in status.names
 
 
-def test_fixes_without_altitude_count_horizontally_and_the_status_names_what_is_missing() -> None:
+def test_fixes_without_altitude_correct_horizontally_and_are_reported() -> None:
     robot = Robot(10.0)
     operator, played = fused({"robot/imu": robot.imu, "robot/fix": robot.fixes(altitude=False)}, **HEADING)
     made: list[Any] = list(played["odometry"])

@@ -106,7 +106,7 @@ def test_messages_that_do_not_come_after_the_last_are_counted_and_not_used_twice
     assert sum(int(figures[f"robot/x, {fate}"]) for fate in ("used", "refused", "unconfirmed")) == 1
 
 
-def test_an_inertial_sample_without_covariance_is_as_good_as_the_last_and_the_first_must_have_one() -> None:
+def test_inertial_sample_without_covariance_takes_the_last_one() -> None:
     operator = begun()
     imu = Robot(1.2).imu[52]
     for k, C in enumerate((None, np.zeros((3, 3)), np.full((3, 3), NAN))):

@@ -205,7 +205,7 @@ def test_positions_that_jump_are_named_and_not_followed_since_the_inertial_senso
 
 @pytest.mark.long
 @pytest.mark.parametrize("wheels", [True, False])
-def test_positions_that_repeat_while_the_robot_drives_on_are_frozen_and_used_again_when_they_move(wheels: bool) -> None:
+def test_repeated_positions_in_motion_are_frozen_until_they_change(wheels: bool) -> None:
     drive = Drive(11.0)
     run = Run(drive, drive.fixes(frozen=(6.0, 9.0)), *([drive.wheels(1.0)] if wheels else []))
     first, text = run.alarms["robot/fix"][0]

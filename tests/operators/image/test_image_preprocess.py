@@ -90,7 +90,7 @@ def test_the_fisheye_is_that_of_its_paper() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_an_undistorted_image_shows_what_its_calibration_says(lens: str) -> None:
+def test_undistorted_image_matches_its_calibration(lens: str) -> None:
     raw = camera(**LENSES[lens])
     image, info, counts = outcome(prepared(raw_image(raw), raw))
     assert (info.distortion, info.distortion_model, info.frame) == (None, "none", "camera")

@@ -83,7 +83,7 @@ def test_a_known_start_or_a_position_decides() -> None:
         assert max(off(drive, played)) < 0.2
 
 
-def test_what_is_followed_comes_back_from_a_snapshot() -> None:
+def test_competing_hypothesis_is_restored_from_a_snapshot() -> None:
     drive = HallDrive(2.0)
     _, operator = localized(drive, {"scan": drive.scans()})
     rival = operator.state.fused.competing

@@ -127,7 +127,7 @@ def test_a_table_top_that_few_scans_hit_at_its_edge_stays_though_all_pass_below_
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((5, 3), np.nan), np.zeros((9, 3))])
-def test_a_cloud_that_tells_nothing_is_named_and_survived(points: np.ndarray) -> None:
+def test_uninformative_cloud_is_reported_and_survived(points: np.ndarray) -> None:
     played = mapped([cloud(points), cloud(walls(), 2)], [pose(), pose(stamp=2)])
     first, second = played["status"]
     assert first.levels.tolist() == [1]

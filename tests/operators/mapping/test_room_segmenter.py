@@ -80,7 +80,7 @@ def joined(rooms: Rooms) -> dict[tuple[int, int], tuple[float, float, float]]:
     return {pair: (place[0], place[1], place[2]) for pair, place in zip(pairs, places, strict=True)}
 
 
-def test_rooms_are_parted_at_doors_whose_places_and_widths_are_told() -> None:
+def test_rooms_are_split_at_doors_with_position_and_width() -> None:
     rooms = only(flat())
     left, right, hall = at(rooms, 2.5, 4), at(rooms, 7, 4), at(rooms, 5, 1.3)
     assert sorted((left, right, hall)) == rooms.ids.tolist() == [1, 2, 3]

@@ -55,7 +55,7 @@ def test_a_part_longer_than_the_file_is_thrown_away(served: Served, cache: Path)
     assert fetch(model_of(CONTENT, url=served.url)).read_bytes() == CONTENT
 
 
-def test_another_file_than_the_registry_says_is_deleted(served: Served, cache: Path) -> None:
+def test_file_with_another_checksum_than_the_registry_is_deleted(served: Served, cache: Path) -> None:
     served.content = CONTENT[:-1] + b"x"
     with pytest.raises(FetchError, match=r"net: what arrived is another file: .* with sha256 [0-9a-f]{64}, expected"):
         fetch(model_of(CONTENT, url=served.url))
@@ -98,7 +98,7 @@ def test_a_download_has_a_bound_of_time_and_goes_on_in_the_next_call(
     assert fetch(model).read_bytes() == CONTENT
 
 
-def test_without_network_the_error_says_where_to_put_the_file(cache: Path) -> None:
+def test_error_without_network_gives_the_path_for_the_file(cache: Path) -> None:
     url = "http://127.0.0.1:9/net.onnx"
     with pytest.raises(FetchError) as caught:
         fetch(model_of(CONTENT, url=url))

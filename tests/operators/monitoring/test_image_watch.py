@@ -42,7 +42,7 @@ def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
     assert [m.stamp for m in played["checked"]] == [0, 2]
 
 
-def test_watches_repeat_and_a_restored_one_knows_the_last_image() -> None:
+def test_restored_watch_repeats_with_its_last_image() -> None:
     first, second = assert_repeats(ImageWatch, [(each,) for each in images(50, 50)], 1)
     assert "checked" in first
     assert "checked" not in second

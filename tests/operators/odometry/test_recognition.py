@@ -48,7 +48,7 @@ def test_what_looks_like_two_things_is_paired_with_neither_and_each_thing_once()
     assert sorted(pairs_of(again, known)) == [[4, 0], [5, 1], [6, 2], [7, 3]]
 
 
-def test_what_is_of_another_size_is_no_rival_and_no_pair() -> None:
+def test_keypoints_of_another_size_are_neither_rivals_nor_pairs() -> None:
     known = drawn(4)
     twice = np.concatenate([known, near(known, 2)])
     sizes = np.array([1.0, 1.5, 0.5, 2.0] + [9.0] * 4)

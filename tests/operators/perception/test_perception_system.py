@@ -170,7 +170,7 @@ CHOICES = {
 @pytest.mark.parametrize(
     "chosen", [pytest.param(n, marks=() if n == "imu wheels" else pytest.mark.long) for n in CHOICES]
 )
-def test_it_takes_what_is_there(room: Room, chosen: str) -> None:
+def test_system_runs_with_any_subset_of_sensors(room: Room, chosen: str) -> None:
     sensors, (there, gone), made = tuple(chosen.split()), CHOICES[chosen], set[str]()
     with room.system(sensors) as system:
         assert gone <= system.left_out.keys()
@@ -227,7 +227,7 @@ def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None
     ],
     ids=["none", "unknown", "depth_info", "image_info", "extrinsics", "fusion"],
 )
-def test_what_is_missing_is_named(
+def test_missing_or_unknown_settings_are_named(
     room: Room, sensors: tuple[str, ...] | None, options: dict[str, Any], fault: str
 ) -> None:
     real: dict[str, Message] = {"image_info": room.image_info, "extrinsics": room.extrinsics}

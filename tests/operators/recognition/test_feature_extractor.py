@@ -46,7 +46,7 @@ def test_the_model_is_named_by_its_file_so_that_vectors_of_two_are_not_compared(
     assert found.vectors.shape == (1, 256)
 
 
-def test_an_image_without_detections_of_its_own_has_no_vectors_and_is_counted(classifier: Path) -> None:
+def test_image_without_detections_has_no_vectors_and_is_counted(classifier: Path) -> None:
     shown, boxes = scene()
     operator = FeatureExtractor(weights=str(classifier), per="object")
     (found,) = play(operator, {"image": [shown.replace(stamp=5)], "detections": [boxes]})["features"]

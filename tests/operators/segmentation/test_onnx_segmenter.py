@@ -181,7 +181,7 @@ def test_unsure_pixels_become_void_by_one_threshold_or_by_class(tmp_path: Path) 
         segmented(model=model, class_thresholds={"wal": 0.9})
 
 
-def test_the_status_tells_share_and_confidence_of_each_class(tmp_path: Path) -> None:
+def test_status_reports_share_and_confidence_of_each_class(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED)
     played = play(OnnxSegmenter(model=model, with_confidence=True), {"image": [image()]})
     (found,), (status,) = played["segmentation"], played["status"]

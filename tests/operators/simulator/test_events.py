@@ -119,7 +119,7 @@ def test_a_share_of_the_depth_is_missing_in_patches(
         assert (np.diff(gone.astype(int), axis=1) != 0).mean() < 0.3  # patches; of specks it would be half
 
 
-def test_a_knocked_camera_sees_from_elsewhere_than_its_calibration_says(
+def test_knocked_camera_deviates_from_its_calibration(
     healthy: dict[str, list[Any]], faulty: dict[str, list[Any]]
 ) -> None:
     apart = [(a.data != b.data).mean() for a, b in zip(healthy["image"], faulty["image"], strict=True)]

@@ -209,7 +209,7 @@ def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["office", pytest.param("corridor", marks=pytest.mark.long)])
-def test_a_robot_is_said_to_drive_while_it_moves_and_to_rest_while_it_stands(name: str) -> None:
+def test_robot_activity_is_driving_in_motion_and_resting_at_standstill(name: str) -> None:
     robot = next(thing for thing in world(name, 0).things if isinstance(thing.mover, Driving))
     seen = set()
     for t in np.arange(0.02, 150, 0.37):

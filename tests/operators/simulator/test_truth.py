@@ -289,7 +289,7 @@ def test_a_goal_that_is_given_is_reached(robot: SimulatedRobot) -> None:
     assert "drink" in reached
 
 
-def test_what_is_on_something_touches_its_surface_from_above(robot: SimulatedRobot) -> None:
+def test_objects_touch_the_surface_of_their_carrier(robot: SimulatedRobot) -> None:
     """A ray downwards from just inside an object's bottom meets its carrier within a centimetre."""
     world = robot._stage.world
     checked = 0

@@ -278,7 +278,7 @@ def test_a_topic_of_another_kind_is_refused_by_name(source: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_run_without_a_recording_says_what_to_do(source: str) -> None:
+def test_recorded_source_without_a_recording_raises_with_the_remedy(source: str) -> None:
     operator: Source = getattr(sources, source)()
     with pytest.raises(RuntimeError, match=f"{source} stands for streams of a recording.*dataflow replay RECORDING"):
         operator.setup()

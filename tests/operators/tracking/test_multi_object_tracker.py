@@ -173,7 +173,7 @@ def test_unusable_boxes_are_counted_and_survived() -> None:
     assert status.levels[0] == 1
 
 
-def test_another_image_size_begins_anew_and_another_camera_is_refused() -> None:
+def test_another_image_size_resets_the_tracks_and_another_camera_is_refused() -> None:
     changed = [image(k, [walker(100)], width=640 if k < 3 else 320) for k in range(6)]
     assert ids(tracked(changed)[-1]) == [2]
     with pytest.raises(OperatorFailure, match="detections are of camera rear, those before were of camera"):

@@ -180,7 +180,7 @@ def _nees(error: Array, covariance: Array, block: slice) -> float:
 
 
 @pytest.mark.long
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_are_consistent_with_the_covariance() -> None:
     from scipy.stats import chi2  # takes a second
 
     checks = [1.5, 3.0, 4.48, 5.4]
@@ -190,7 +190,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     assert ((anees > low) & (anees < high)).all(), anees
 
 
-def test_rest_is_told_from_motion() -> None:
+def test_rest_is_distinguished_from_motion() -> None:
     t = np.arange(25) / RATE
     for begin, expected in ((0.0, True), (3.0, False)):
         gyro, accel = Motion().readings(t + begin)

@@ -101,7 +101,7 @@ def test_late_measurements_give_the_bits_of_those_in_time(lateness: list[int]) -
     assert {k: h.used for k, h in inorder.health.items()} == {k: h.used for k, h in late.health.items()}
 
 
-def test_what_is_too_late_is_counted() -> None:
+def test_late_measurements_are_ignored_and_counted() -> None:
     made = Made(4.0)
     filter = made.filter(window=0.5)
     made.fed(filter, made.fixes[3:])

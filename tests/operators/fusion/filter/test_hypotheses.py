@@ -25,9 +25,7 @@ STATE = State(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.
         (0.9, False, True),
     ],
 )
-def test_the_given_heading_is_in_question_from_a_chance_of_one_in_thirty_until_one_in_a_hundred(
-    wrong: float, before: bool, expected: bool
-) -> None:
+def test_given_heading_is_doubted_with_hysteresis(wrong: float, before: bool, expected: bool) -> None:
     """Two headings against it, one of which alone would not do."""
     weights = [math.log(1 - wrong), *[math.log(wrong / 2)] * 2]
     hypotheses = [Hypothesis(w, STATE, against=k > 0) for k, w in enumerate(weights)]

@@ -118,7 +118,7 @@ def test_what_an_error_does_to_a_residual_is_its_jacobian(kind: str) -> None:
         np.testing.assert_allclose((here - there) / 1e-4, J[:, SIZE + k], atol=1e-9)
 
 
-def test_settings_ask_for_errors_and_the_noise_is_what_is_left() -> None:
+def test_settings_enable_error_states_and_reduce_the_noise() -> None:
     settings = {
         "robot/fix": SensorSettings(drift=(0.3, 0.3, 0.6), drift_time=20.0),
         "robot/wheels": SensorSettings(use="wheels", scale_sigma=0.02),
@@ -210,7 +210,7 @@ def test_offsets_come_back_from_a_snapshot_and_older_snapshots_get_them() -> Non
     assert more.offsets()["z"][1] == pytest.approx(0.3, rel=0.01)
 
 
-def test_the_operator_says_what_it_found_and_its_poses_are_right() -> None:
+def test_operator_reports_the_estimated_offset_and_its_poses_are_right() -> None:
     robot = Robot(8.0)
     late = [p.replace(stamp=p.stamp + 120_000_000) for p in robot.poses()]
     found: dict[str, Any] = {}

@@ -48,7 +48,7 @@ def test_positions_are_combined_as_by_weighted_least_squares(seed: int) -> None:
     assert np.allclose(point, expected @ pulls, atol=1e-6)
 
 
-def test_triangulated_points_are_as_good_as_their_covariance_says() -> None:
+def test_triangulation_errors_are_consistent_with_the_covariance() -> None:
     rng = np.random.default_rng(0)
     normalised = []
     for _ in range(400):

@@ -76,7 +76,7 @@ def test_two_poses_that_contradict_each_other_are_a_diagnostic_and_the_covarianc
         assert status.messages[0] == "sensors contradict each other"
 
 
-def test_a_sensor_noisier_than_it_says_loses_its_say() -> None:
+def test_sensor_noisier_than_its_covariance_is_down_weighted() -> None:
     rng = np.random.default_rng(4)
     noisy = [p.replace(position=p.position + rng.normal(0, 0.05, 3)) for p in poses(200, rng)]
     played, _ = body({"a": poses(200, rng), "b": poses(200, rng), "noisy": noisy})

@@ -102,7 +102,7 @@ def test_what_trembles_as_it_moves_slowly_is_not_taken_for_standing() -> None:
 
 
 @pytest.mark.long
-def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
+def test_known_even_motion_is_not_taken_for_standstill() -> None:
     t = np.arange(12 * RATE) / RATE
     velocity = np.column_stack([0.5 * np.clip(t - 1.5, 0, 1), 0 * t, 0 * t])  # without a tremble: as a rail
     without, off = outage(velocity, 0 * t, 8.0)

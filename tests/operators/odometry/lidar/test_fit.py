@@ -68,7 +68,7 @@ def test_along_a_direction_that_no_wall_crosses_the_prediction_stands_and_is_nam
     assert sigma[axis] > 20 * np.delete(sigma[:3], axis).max()
 
 
-def test_a_floor_and_a_ceiling_hold_height_roll_and_pitch_and_leave_the_rest_where_it_was_predicted() -> None:
+def test_floor_and_ceiling_constrain_height_roll_and_pitch_only() -> None:
     """However little is known of the motion: the pose does not run away along what nothing holds."""
     found = laid((2,), TRUTH, np.eye(4))
     assert len(found.blind) == 3

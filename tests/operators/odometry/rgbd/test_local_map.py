@@ -54,7 +54,7 @@ def test_only_the_newest_keyframes_keep_what_frames_are_compared_with() -> None:
     assert sum(held(k.surface) for k in known.keyframes) < capacity * 1.1 * grid + (RECENT + 4) * whole
 
 
-def test_planes_that_are_made_anew_are_the_same() -> None:
+def test_recomputed_planes_are_identical() -> None:
     surface = keyframe(0).surface
     planes, bordered = surface.bordered_planes, surface.bordered
 
@@ -148,7 +148,7 @@ def test_keyframes_that_rest_on_a_wrong_place_go_back_and_those_before_it_stay()
     assert [float(k.place_variance) for k in known.keyframes[:3]] == [0.0, 0.0, pytest.approx(3e-2)]
 
 
-def test_a_view_is_laid_on_the_newest_keyframe_and_then_on_those_that_see_most_nearly_what_it_sees() -> None:
+def test_nearby_keyframes_are_the_newest_then_those_of_largest_overlap() -> None:
     """Of a wall 2 m away, at steps of 0.2 m; what is more than 1.4 m aside shares too little."""
     known, view = of_segments(*[0] * 14, 1), np.eye(4)
     view[0, 3] = 0.63

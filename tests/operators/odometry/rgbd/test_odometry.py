@@ -546,7 +546,7 @@ def test_parameters_are_by_default_what_settings_are() -> None:
 
 
 @pytest.mark.long
-def test_a_view_that_is_found_again_in_a_new_map_apart_says_nothing_of_the_old_one() -> None:
+def test_relocalization_in_a_separate_map_leaves_the_old_map_lost() -> None:
     frames, poses = sequence(60, 1.5)
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
     shown = [*poses[:20], *poses[45:48]]
@@ -749,7 +749,7 @@ def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
     assert_one_calibration(VisualOdometry, given, ["image_info", "depth_info"], "depth", other, 5)
 
 
-def test_a_clock_that_begins_anew_begins_a_new_path() -> None:
+def test_clock_reset_starts_a_new_trajectory() -> None:
     operator, calibration = VisualOdometry(), (info("color", K_COLOR), info("depth", K_DEPTH))
     operator.setup()
     *first, last = zip(*messages(13)[:2], strict=True)

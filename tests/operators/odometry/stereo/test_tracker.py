@@ -158,7 +158,7 @@ def test_points_that_are_gone_still_hold_the_window() -> None:
     assert off["held"] < 0.1
 
 
-def test_what_is_known_of_poses_stays_when_the_first_of_them_goes() -> None:
+def test_marginalizing_the_first_pose_keeps_the_information_on_the_others() -> None:
     """The last poses are as sure of each other as with the first one beside them."""
     rng = np.random.default_rng(2)
     poses = np.array(driving(4))
@@ -196,7 +196,7 @@ def test_sightings_are_kept_by_point_and_go_with_their_frame() -> None:
     assert two.fitting(squared, 4).tolist() == [True, False, True, False]
 
 
-def test_what_is_known_of_poses_is_the_same_about_others_nearby() -> None:
+def test_pose_information_relinearizes_at_nearby_poses() -> None:
     """The gradient of a sum of squares at another place, to first order; a pose that is new is free."""
     poses, rng = np.array(driving(2)), np.random.default_rng(4)
     H = rng.normal(size=(13, 13))

@@ -175,7 +175,7 @@ def test_activities_repeat_and_a_restored_recogniser_goes_on() -> None:
     assert_repeats(Recognizer, [{"nodes": g, "postures": p} for g, p in zip(graphs, seen, strict=True)], 11)
 
 
-def test_an_agent_that_was_lost_begins_anew_and_an_empty_graph_is_no_error() -> None:
+def test_lost_agent_restarts_its_activity_and_an_empty_graph_is_valid() -> None:
     graphs = [nodes(0.0, [person(0, 0)]), nodes(0.25, []), nodes(0.5, [person(5, 5)])]
     messages = play(Recognizer(), {"nodes": graphs})["activities"]
     assert [m.count for m in messages] == [1, 0, 1]

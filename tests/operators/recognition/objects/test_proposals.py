@@ -39,7 +39,7 @@ def test_proposals_overlap_little_and_fall_in_score(trunk: Trunk) -> None:
     assert proposed.shape[1] == 4
 
 
-def test_a_box_is_described_by_what_is_in_it(trunk: Trunk) -> None:
+def test_box_descriptor_pools_the_features_inside_it(trunk: Trunk) -> None:
     """A glance whose maps are 1 on the left half and 2 on the right, in one channel."""
     glance = trunk.look(PIXELS)
     for each in glance.trunk:

@@ -94,7 +94,7 @@ def test_things_stand_on_surfaces_by_their_height_and_extent() -> None:
 
 
 @pytest.mark.parametrize(("below", "lies"), [(0.02, True), (0.05, False)])
-def test_what_is_flat_lies_on_a_plane_that_is_a_little_off(below: float, lies: bool) -> None:
+def test_flat_object_lies_on_a_slightly_offset_plane(below: float, lies: bool) -> None:
     top = 0.75
     magazine: Thing = (8, "book", (2, 0.1, top - below), (0.2, 0.3, 0.01))
     found = first(TABLE, TOP, magazine)
@@ -278,7 +278,7 @@ def test_gap_is_symmetric_and_no_share_exceeds_one(x: float, y: float, size: flo
     assert gap(first, second) == 0 or footprint_share(first, second) == 0
 
 
-def test_hysteresis_forgets_what_is_no_more() -> None:
+def test_hysteresis_forgets_removed_objects() -> None:
     held = Hysteresis(0.5, 0.25, 0.4)
     held.update(0, {(1, "on", 2): 1.0})
     held.forget({2})
@@ -293,7 +293,7 @@ def test_orientation_turns_a_footprint() -> None:
 
 
 @pytest.mark.parametrize(("moving", "said"), [(0.05, "resting"), (0.5, "unknown"), (0.95, "driving")])
-def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves(moving: float, said: str) -> None:
+def test_vehicle_known_to_stand_rests_though_its_box_moves(moving: float, said: str) -> None:
     seen = [room(k, [(2, "car", (8 + 0.3 * k, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(8)]
     graph, act = driven(seen, moving)
     assert (doing(act), graph) == (said, np.float32(moving))
@@ -319,7 +319,7 @@ def driven(seen: Sequence[SceneGraph], moving: float, ago: int = 0) -> tuple[np.
 
 
 @pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
-def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(moving: float, speed: float) -> None:
+def test_agent_has_the_velocity_of_its_centre_unless_at_standstill(moving: float, speed: float) -> None:
     graph = LayeredGraph(GraphSettings())
     for k in range(8):
         center, size = np.array([40 + 2.0 * k, 3, 0.7]), np.array([4, 1.8, 1.5])

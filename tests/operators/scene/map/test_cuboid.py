@@ -133,7 +133,7 @@ def test_fit_reveals_the_view_of_another_thing() -> None:
 
 
 @pytest.mark.parametrize("before", [None, 0], ids=["open", "settled before the room's heading was known"])
-def test_a_shelf_lies_along_the_room_where_views_of_what_is_beside_it_would_turn_it(before: int | None) -> None:
+def test_shelf_is_aligned_with_the_room_despite_views_of_its_neighbour(before: int | None) -> None:
     """Boxes in the image of a shelf and a part of its neighbour, which some views show as one."""
     shelf: Box = (np.array([2.8, 0.0, 0.7]), np.array([0.31, 1.0, 1.4]), 0.0)
     askew: Box = (shelf[0], np.array([0.31, 1.0, 1.4]), 0.25)

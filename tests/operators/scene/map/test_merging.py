@@ -54,7 +54,7 @@ def test_entries_that_are_one_are_among_those_that_may_be() -> None:
     assert not may.all()
 
 
-def test_what_is_within_reach_of_a_box_is_compared_with_it() -> None:
+def test_observations_within_reach_of_a_box_are_compared() -> None:
     rng = np.random.default_rng(4)
     rows = np.column_stack([rng.uniform(0, 2, (40, 3)), rng.uniform(0.05, 1, (40, 3)), rng.uniform(-3, 3, 40)])
     voxels = VoxelSet.of_each([place + np.zeros((1, 3)) for place in rng.uniform(0, 2, (50, 3))], 0.03)

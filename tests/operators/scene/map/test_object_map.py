@@ -141,7 +141,7 @@ def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: floa
     assert [size[2], *center[1:]] == pytest.approx([1.4, along, 0.3], abs=0.15)
 
 
-def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
+def test_part_never_seen_beside_its_whole_is_no_separate_object() -> None:
     """The foot of a thing, detected as something else where its top is hidden."""
     foot: Solid = ((2.0, 0.0, 0.07), (0.12, 0.12, 0.06))
     scenes: list[list[tuple[Solid, int]]] = [[(THING, BOX)]] * 6 + [[(foot, MUG)]] * 4 + [[(THING, BOX)]] * 2

@@ -87,7 +87,7 @@ def test_a_moved_object_is_moved_and_not_doubled() -> None:
     assert best_iou(message, CRATE) < 0.05
 
 
-def test_what_is_taken_away_goes_and_what_is_hidden_stays() -> None:
+def test_removed_objects_go_and_occluded_ones_stay() -> None:
     screen: Solid = ((1.7, 0.5, 0.6), (0.1, 1.2, 1.2), 0.0, 0)
     assert ids(last(mapped(views([[CRATE, OTHER]] * 6 + [[OTHER]] * 8)))) == [2]
     hidden = views([[CRATE, OTHER]] * 6 + [[CRATE, OTHER, screen]] * 8)
@@ -134,7 +134,7 @@ def test_maps_repeat_and_a_restored_one_goes_on() -> None:
     assert_repeats(partial(SemanticMap, labels=MUGS_MOVE), views([[CRATE, OTHER]] * 8), 4)
 
 
-def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
+def test_box_is_completed_away_from_the_viewer_by_the_usual_size() -> None:
     """The spine of a book in a shelf, seen along x: 4 cm wide, no depth."""
     seen = (np.array([2.0, 0, 1]), np.array([0.0, 0.04, 0.22]), 0.0)
     center, size, _ = completed(seen, np.array([1.0, 0.0]), BOOK)

@@ -98,7 +98,7 @@ def test_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", OFFICE_AND_LONG)
-def test_what_is_carried_lies_on_its_table_while_it_is_not_held(name: str) -> None:
+def test_carried_object_lies_on_its_table_while_not_held(name: str) -> None:
     here = world(name, 0)
     for thing in (t for t in here.objects() if isinstance(t.mover, Carried)):
         for t in np.arange(0, 60, 1.3):

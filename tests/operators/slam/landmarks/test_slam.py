@@ -151,7 +151,7 @@ def test_a_loop_takes_the_drift_out() -> None:
     assert np.linalg.norm(errors(walk, made)[:2]) < 0.3 * np.linalg.norm(errors(walk, odometry)[:2])
 
 
-def test_landmarks_are_told_apart_without_their_identities() -> None:
+def test_landmarks_without_identities_are_distinguished() -> None:
     for seed in range(5):
         walk = Walk(seed)
         made = walk.filtered(known=False)
@@ -258,7 +258,7 @@ def test_bad_odometry_is_counted_and_the_next_covers_both_steps() -> None:
 
 
 @pytest.mark.long
-def test_odometry_that_begins_anew_is_a_jump_and_the_landmarks_place_the_robot_again() -> None:
+def test_odometry_reset_is_a_jump_and_landmarks_relocalize_the_robot() -> None:
     walk = Walk(2)
     messages = walk.messages()
     odometry = list(messages["odometry"])

@@ -126,7 +126,7 @@ def _nothing() -> Observations:
     return Observations(none, none, np.zeros((0, 2)), np.zeros(0), SIGMA_PIXEL, np.zeros(0))
 
 
-def test_wrong_sightings_are_outvoted_and_told() -> None:
+def test_wrong_sightings_are_outvoted_and_have_large_residuals() -> None:
     poses, points, seen = scene(7)
     rng = np.random.default_rng(1)
     wrong = rng.random(len(seen.points)) < 0.1
