@@ -44,7 +44,7 @@ def test_a_graph_runs_and_reports(tmp_path: Path) -> None:
         assert recording.graph.name == "watch"
 
 
-def test_what_runs_here_is_what_runs_in_processes(tmp_path: Path) -> None:
+def test_run_in_this_process_equals_one_in_processes(tmp_path: Path) -> None:
     here = watch().run(record=tmp_path / "here.mcap")
     there = dataflow.launch(watch(), record=tmp_path / "there.mcap", placement="process_each")
 

@@ -54,7 +54,7 @@ def test_a_session_gives_the_messages_of_a_run_and_its_recording_verifies(
     assert [again[f"robot1/{name}"] for name in made] == [first[f"robot1/{name}"] for name in made]
 
 
-def test_what_follows_from_frontiers_alone_comes_with_the_step_that_decides_it(run: dataflow.RunResult) -> None:
+def test_session_step_returns_no_undecided_messages(run: dataflow.RunResult) -> None:
     first = run.open()["image"][0]
     with dataflow.Session(small(), static=statics(run)) as session:
         assert "cloud/cloud" not in session.put(first.stamp, {"camera/image": first})

@@ -81,7 +81,7 @@ def test_a_lost_echo_that_decided_is_made_finite_and_a_threshold_is_met_from_eit
     assert chain.whole
 
 
-def test_what_changes_a_value_most_is_named_first(spiky: Path) -> None:
+def test_blame_names_the_largest_effect_first(spiky: Path) -> None:
     chain = found(spiky, "smooth/out.value@4")
 
     assert sensed(chain)[0] == rangers.SPIKE

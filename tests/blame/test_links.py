@@ -38,9 +38,7 @@ def chain(value: object, *links: Link) -> Chain:
         (np.array([1.0, np.nan]), np.array([9.0, 2.0]), np.inf),
     ],
 )
-def test_a_change_is_the_largest_difference_of_numbers_and_of_anything_else_without_bound(
-    before: object, after: object, by: float
-) -> None:
+def test_change_is_the_largest_numeric_difference_else_infinite(before: object, after: object, by: float) -> None:
     assert change(before, after) == by
 
 
@@ -62,7 +60,7 @@ def test_a_nudge_weighs_as_much_as_the_whole_of_a_number_and_other_content_stand
     assert weighed(5.0, ("the one before", 5.5), ("another", 5.25)) == (0.0, 0.5)
 
 
-def test_a_call_leads_on_by_its_inputs_or_by_a_state_that_a_later_call_had_of_an_earlier_one() -> None:
+def test_calls_are_linked_by_inputs_or_by_state() -> None:
     nudge = Effect("nudged", (), 1.0)
     track, early = Call("track", 5), Call("track", 2)
     found = chain(0.0, link(TARGET, track, nudge), link(Call("track", 7), early, nudge, name=""))

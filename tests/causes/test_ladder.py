@@ -128,7 +128,7 @@ def test_more_causes_than_there_are_re_runs_for_stay_open_and_are_not_guessed() 
     assert causes == set(found.causes).union(*found.open)
 
 
-def test_what_differs_with_everything_fixed_has_no_known_cause() -> None:
+def test_difference_with_all_sources_fixed_has_no_known_cause() -> None:
     found = climbed(Operator({WALL}, differs=True))
 
     assert found.settled is False
@@ -143,7 +143,7 @@ def test_sources_that_cannot_be_fixed_here_are_not_tried() -> None:
 
 
 @pytest.mark.parametrize("cause", [HASHES, HEAP, MODULE, THREADS, *MOVED, LOCALE, GAIN, TABLE, MODELS, WORKING])
-def test_what_a_repeating_operator_depends_on_is_named(cause: str) -> None:
+def test_source_on_which_a_repeating_operator_depends_is_named(cause: str) -> None:
     found = climbed(Repeating({cause}, reads={WALL, GAIN}), repeats=True)
 
     assert found.repeats

@@ -126,7 +126,7 @@ def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) 
     assert {key for key in one if one[key] != other[key]} == changes
 
 
-def test_what_was_given_is_known_also_where_compiled_code_asked() -> None:
+def test_fixed_values_are_noted_when_compiled_code_reads_them() -> None:
     program = FIX.format(module="given", fixed=set(CHANCE), varied=set()) + "print(interventions.given)"
 
     sorted_by_id, given = ran(program).splitlines()

@@ -198,7 +198,7 @@ def test_an_interrupt_clears_the_line_and_stays(
 
 
 @pytest.mark.long
-def test_what_cannot_begin_is_named() -> None:
+def test_debugging_an_unknown_operator_or_call_is_refused() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
 

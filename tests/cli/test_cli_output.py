@@ -266,7 +266,7 @@ def printed(report: RunReport, width: int = 200) -> list[str]:
     return text_of(console)
 
 
-def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
+def test_summary_lists_rates_losses_and_files_first() -> None:
     wrote = {"path": "out/a_000.mcap", "parts": ["out/a_000.mcap", "out/a_001.mcap"], "messages": 9, "bytes": 5_000_000}
     report = replace(lossy_report(), files={"@recorder": wrote}, sources=("camera",))
 
@@ -320,7 +320,7 @@ def test_summary_has_findings_losses_and_notes_once(changed: dict[str, Any], lin
     assert printed(replace(lossy_report(), **changed)).count(line) == 1
 
 
-def test_what_a_flight_recorder_could_not_keep_is_among_the_losses() -> None:
+def test_failed_flight_recordings_are_listed_among_the_losses() -> None:
     """Not among what it has kept, though its name stands there."""
     kept = {"path": "a.mcap", "reasons": [{"what": "asked for"}], "bytes": 5_000_000}
     failed = {"path": "b.mcap", "reasons": [{"what": "asked for"}], "bytes": 0, "error": "no space"}

@@ -248,7 +248,7 @@ def test_messages_that_cannot_be_read_are_passed_over_and_counted(tmp_path: Path
         assert len(stream.stamps) == len(read)
 
 
-def test_what_cannot_be_read_in_both_is_not_the_same(tmp_path: Path) -> None:
+def test_streams_unreadable_in_both_recordings_are_different(tmp_path: Path) -> None:
     path = damaged_chunk(tmp_path / "a.mcap")
     with Recording(path) as a, Recording(path) as b:
         report = diff(a, b)

@@ -256,7 +256,7 @@ def test_killed_process_is_started_again_and_loses_nothing(sweep: Sweep, tmp_pat
 
 
 @pytest.mark.long
-def test_what_takes_too_long_is_ended_and_tried_again_by_the_next_sweep(sweep: Sweep, tmp_path: Path) -> None:
+def test_timed_out_runs_are_retried_by_the_next_sweep(sweep: Sweep, tmp_path: Path) -> None:
     marker = tmp_path / "wait"
     marker.write_text("")
     words = ("--set", f"scaled.wait={tmp_path}", "--jobs", "2")

@@ -134,7 +134,7 @@ def test_all_values_are_read_and_those_that_can_change_listed(dataflow) -> None:
         (["tuned.factor", "1", "--timeout", "0"], 2, "--timeout 0: expected seconds, more than 0"),
     ],
 )
-def test_what_cannot_be_set_is_refused_with_the_reason(dataflow, words: list[str], code: int, told: str) -> None:
+def test_invalid_parameter_value_is_refused_with_the_reason(dataflow, words: list[str], code: int, told: str) -> None:
     before = dataflow("param", "get", "tuned.factor").stdout
 
     assert told in " ".join(dataflow("param", "set", *words, code=code).stderr.split())

@@ -49,7 +49,7 @@ def numbers(path: str) -> list[tuple[int, int]]:
         return [(m.incarnation, m.seq) for m in recording.messages(["test/smooth/mean"])]
 
 
-def test_what_was_missed_is_counted_by_numbers(graph: Graph, tmp_path: Path) -> None:
+def test_missed_messages_are_counted_by_sequence_number(graph: Graph, tmp_path: Path) -> None:
     with AttachedRecorder(tmp_path / "a.mcap", graph, ["test/smooth/mean"], metadata={}) as recorder:
         for seq in (5, 6, 9, 10):
             recorder.take(said(seq))
@@ -59,7 +59,7 @@ def test_what_was_missed_is_counted_by_numbers(graph: Graph, tmp_path: Path) -> 
     assert numbers(recorder.tally.files[0]) == [(0, 5), (0, 6), (0, 9), (0, 10), (1, 2)]
 
 
-def test_what_cannot_be_is_left_out_and_counted(graph: Graph, tmp_path: Path) -> None:
+def test_invalid_messages_are_left_out_and_counted(graph: Graph, tmp_path: Path) -> None:
     with AttachedRecorder(tmp_path / "a.mcap", graph, ["test/smooth/mean"], metadata={}) as recorder:
         recorder.take(said(5))
         recorder.take(said(5))  # twice

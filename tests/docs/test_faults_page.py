@@ -41,7 +41,7 @@ SHOWN_BY = {
     "a process gives no sign of life (stopped, swapped out)": """
         a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy
         stopped_consumer_is_not_waited_for_and_starts_a_new_backlog
-        what_did_not_reach_a_consumer_is_counted_against_it
+        gap_at_a_consumer_is_counted_as_its_drops
     """,
     "a process lives and takes no messages (a call that holds the interpreter)": """
         stopped_consumer_delays_no_other_process_and_its_loss_is_counted

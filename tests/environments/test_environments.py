@@ -193,7 +193,7 @@ def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs
 
 
 @pytest.mark.long
-def test_what_decided_a_value_is_found_in_the_environment_of_its_operators(recorded: Path, tmp_path: Path) -> None:
+def test_blame_runs_in_the_environment_of_its_operators(recorded: Path, tmp_path: Path) -> None:
     told = command("blame", str(recorded), "--field", "first/y.vectors@0.01", folder=tmp_path)
     assert told.returncode == 0, told.stderr
     assert "first #10" in told.stdout

@@ -209,7 +209,7 @@ class Fixed(Operator):
         (Fixed(), r"Fixed\.alarm emitted Alarm without stamp: static_outputs\(\) is no firing .*give stamp="),
     ],
 )
-def test_what_no_firing_makes_gives_its_stamp_and_frame(operator: Operator, message: str) -> None:
+def test_messages_emitted_outside_firings_need_stamp_and_frame(operator: Operator, message: str) -> None:
     with pytest.raises(OperatorFailure, match=message):
         play(operator, None if isinstance(operator, Source) else {"number": [Number(stamp=1, value=0)]})
 

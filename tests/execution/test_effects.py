@@ -221,7 +221,7 @@ def test_a_prompt_that_a_call_sees_besides_its_arguments_is_a_miss_where_it_chan
     assert f"{place} differs from the recorded call" in found.got
 
 
-def test_what_a_call_changes_in_its_object_and_credentials_are_no_miss() -> None:
+def test_effect_key_ignores_object_state_and_credentials() -> None:
     def body(token: str) -> Body:
         clients: list[Client] = []
 
@@ -521,7 +521,7 @@ def test_the_answers_of_one_firing_are_bounded_together() -> None:
     assert again(recorded(tries)).result.verdict == "identical"
 
 
-def test_what_has_no_key_or_no_firing_is_refused() -> None:
+def test_effects_without_key_or_firing_are_refused() -> None:
     def tries(operator: Asking, x: FeatureVector) -> float:
         with pytest.raises(EffectError, match="a call is known by its name"):
             operator.effect(lambda: 1)

@@ -137,7 +137,7 @@ def test_generators_of_gpus_are_seeded_when_a_call_initialises_them_and_in_each_
 
 
 @pytest.mark.parametrize("before", [0, 2], ids=["nothing drawn before", "drawn before"])
-def test_what_a_module_draws_or_seeds_while_it_is_loaded_is_taken_back(modules: Path, before: int) -> None:
+def test_random_draws_during_import_are_undone(modules: Path, before: int) -> None:
     def draws() -> float:
         for _ in range(before):
             random.random(), np.random.random()

@@ -12,7 +12,7 @@ GRAPH = load_text(
 )
 
 
-def test_what_an_operator_depends_on_and_what_depends_on_it() -> None:
+def test_upstream_and_downstream_of_an_operator() -> None:
     assert upstream(GRAPH, ["c"]) == {"cam", "a", "b"}
     assert upstream(GRAPH, ["cam"]) == set()
     assert downstream(GRAPH, ["a"]) == {"b", "c", "aside"}

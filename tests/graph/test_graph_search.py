@@ -48,7 +48,7 @@ def test_a_module_beside_a_nested_graph_is_found(tmp_path: Path) -> None:
     assert "p/a" in load_graph(graph(tmp_path / "g.yaml", "operators: {p: {use: parts/part.yaml}}")).nodes
 
 
-def test_what_lies_beside_the_graph_replaces_no_installed_module(tmp_path: Path) -> None:
+def test_module_beside_the_graph_shadows_no_installed_one(tmp_path: Path) -> None:
     (tmp_path / "colorsys.py").write_text("raise RuntimeError('hijacked')\n")
     sys.modules.pop("colorsys", None)
     load_graph(graph(tmp_path / "g.yaml", f"operators: {{a: {{use: '{module(tmp_path, 'beside_colorsys')}'}}}}"))

@@ -85,7 +85,7 @@ def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_pat
         assert streams.account.unread["/imu"].count == 1
 
 
-def test_what_a_type_has_no_place_for_is_named_with_its_number(tmp_path: Path) -> None:
+def test_unmapped_fields_are_named_with_their_count(tmp_path: Path) -> None:
     scan = {"ranges": np.ones(5, np.float32), "angle_increment": 0.1, "angle_max": 0.4, "range_max": 9.0}
     rows = [
         ("/scan", s, ros("sensor_msgs/LaserScan", header=header(s, "laser"), scan_time=0.1 * (i > 2), **scan))

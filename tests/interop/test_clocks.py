@@ -102,7 +102,7 @@ def test_moved_stamps_never_run_into_the_next() -> None:
     assert found.stamps.tolist() == [5, 6, 7, 8]
 
 
-def test_what_can_be_merged_shares_its_stamp() -> None:
+def test_merged_messages_share_a_stamp() -> None:
     found = repair(np.array([5, 5, 6]), np.array([1, 2, 3], np.uint64), merge=True)
 
     assert found.stamps.tolist() == [5, 5, 6]

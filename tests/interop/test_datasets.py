@@ -78,7 +78,7 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
 
 
-def test_what_no_frame_of_a_lerobot_dataset_takes_is_counted_as_lost_and_not_as_written(tmp_path: Path) -> None:
+def test_messages_in_no_lerobot_frame_are_counted_as_lost(tmp_path: Path) -> None:
     streams_of = arm()
     for k in (4, 5):  # a pause of an hour in front of them
         moved = streams_of["camera/image"][k]

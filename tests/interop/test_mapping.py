@@ -52,7 +52,7 @@ def test_given_topics_are_taken_and_not_proposed_again() -> None:
     assert {m.wanted.name: m.topic for m in found.matches} == {"camera/left": "/b", "camera/right": "/a"}
 
 
-def test_what_nothing_needs_is_only_filled_where_it_is_given() -> None:
+def test_optional_stream_is_mapped_only_if_given() -> None:
     spare = wanted("camera/ground_truth", "Pose", needed=False)
     topics = [Offered("/pose", ("Pose",), 5)]
 

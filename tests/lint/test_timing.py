@@ -67,7 +67,7 @@ def test_a_contract_bounds_rates_and_gaps_and_names_streams() -> None:
     ]
 
 
-def test_what_a_contract_accepts_is_no_finding() -> None:
+def test_gap_allowed_by_the_contract_is_no_finding() -> None:
     stamps = {"robot1/a": [s for s in every(0.1) if not 3.0 < (s - BEGIN) / SECOND < 5.0]}
     assert findings(stamps) == [("gap", "robot1/a")]
     assert findings(stamps, Contract.model_validate({"streams": {"a": {"allow": ["gap"]}}})) == []

@@ -360,7 +360,7 @@ def test_no_message_is_in_a_part_behind_a_full_disk_whose_record_is_lost(
         assert stored == {name: info.count for name, info in was.streams.items()}
 
 
-def test_what_a_part_holds_is_counted_once_however_often_it_refuses(
+def test_messages_of_a_part_are_counted_once_despite_refused_writes(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
 ) -> None:
     """As records of one operator after the other that are to stand in front of it."""

@@ -44,7 +44,7 @@ def test_gap_is_reported_once_and_the_rest_is_taken(count: int, data: st.DataObj
 
 
 @given(st.integers(1, 6).map(stream_of), st.data())
-def test_what_contradicts_a_stream_changes_nothing(own: list[Envelope], data: st.DataObject) -> None:
+def test_contradicting_envelopes_change_nothing(own: list[Envelope], data: st.DataObject) -> None:
     """Places that are past, and the end of time."""
     order = StreamOrder()
     taken: list[Envelope] = []

@@ -145,7 +145,7 @@ def test_padding_that_the_last_row_lacks_takes_no_memory() -> None:
     assert stored_rows("mono8", 3, 1, 1 << 62, row).tolist() == [[0, 1, 2]]
 
 
-def test_what_does_not_fit_is_refused_with_its_numbers() -> None:
+def test_mismatched_pixels_are_refused_with_their_numbers() -> None:
     with pytest.raises(RecordingError, match="needs rows of 12 bytes, got step 12 and 5 bytes"):
         stored_rows("rgb8", 4, 2, 0, np.zeros(5, np.uint8))
     with pytest.raises(RecordingError, match="'h264' is not known; those known are mono8"):

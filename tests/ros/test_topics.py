@@ -150,7 +150,7 @@ def test_a_late_subscriber_gets_what_was_latched_and_both_publishers_count(endpo
             assert source.summary()["lost"] == 0
 
 
-def test_what_a_sink_latches_comes_to_late_subscribers_of_ros(endpoint: str, peer: Peer) -> None:
+def test_latched_messages_reach_late_ros_subscribers(endpoint: str, peer: Peer) -> None:
     sink = Ros2Sink(
         topic="notice", namespace="/robot", router=endpoint, durability="transient_local", depth=1, node="dash"
     )

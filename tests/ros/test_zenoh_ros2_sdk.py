@@ -64,7 +64,7 @@ def test_type_hashes_are_those_of_another_implementation(distro: Any) -> None:
         assert get_type_hash(type_, msg_definition=text, dependencies=parts) == type_hash(type_, distro), type_
 
 
-def test_what_the_other_side_publishes_comes_and_its_losses_are_counted(endpoint: dict[str, Any]) -> None:
+def test_messages_of_a_ros2_publisher_arrive_and_losses_are_counted(endpoint: dict[str, Any]) -> None:
     talker = sdk.ROS2Publisher("/chatter", STRING, "string data\n", node_name="talker", **endpoint["there"])
     with Read(topics.Text(topic="/chatter", router=endpoint["router"])) as read:  # type and hash from its token
         until(lambda: talker.pub.matching_status.matching)

@@ -47,7 +47,7 @@ def test_the_timeline_is_in_the_order_of_time_and_as_dense_as_asked(graph: Graph
     assert [f for f in faults if f.kind == "slow"] == [Fault(1.0, "slow", "mix", {"by": 0.03, "span": 0.2})]
 
 
-def test_what_an_entry_does_does_not_depend_on_the_entries_after_it(graph: Graph) -> None:
+def test_entry_is_independent_of_later_entries(graph: Graph) -> None:
     alone = timeline(graph, KILL)
     together = timeline(graph, KILL, TUNE, SLOW)
 
@@ -91,7 +91,7 @@ def test_invalid_plan_error_names_the_entry_and_reason(graph: Graph, entry: Any,
     assert words in str(caught.value)
 
 
-def test_what_nothing_would_outlive_is_refused() -> None:
+def test_fatal_fault_without_restart_policy_is_refused() -> None:
     fragile = load_graph(HERE / "live.yaml", live=True)
 
     with pytest.raises(ChaosError, match="'kill' would end the run; give 'smooth' a restart policy"):

@@ -78,7 +78,7 @@ def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_veri
 
 
 @pytest.mark.long
-def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_be_completed(tmp_path: Path) -> None:
+def test_recording_of_sensors_only_can_be_completed(tmp_path: Path) -> None:
     graph = _recording_sensors_only(load_graph(HERE / "mixed.yaml", settings=["count=40"]))
     path, out = tmp_path / "thin.mcap", tmp_path / "out.mcap"
     full = run(graph, placement="one_process", record=path)
@@ -92,7 +92,7 @@ def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_b
     assert replay_recording(out, placement="one_process").digests() == full.digests()
 
 
-def test_what_acts_on_the_world_needs_nothing_to_complete_a_recording(tmp_path: Path) -> None:
+def test_acting_operator_is_not_needed_to_complete_a_recording(tmp_path: Path) -> None:
     """It does not act again, so what it alone took may be missing."""
     graph = load_text("""
 graph: acting

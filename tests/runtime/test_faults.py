@@ -315,7 +315,7 @@ def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None
 
 
 @pytest.mark.long
-def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -> None:
+def test_source_drops_are_counted_by_reason_in_report_and_recording(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, params: {sleep: 0.05}, inputs: {x: left/fast}, live: {queue: block}}",
         count=250,
@@ -331,7 +331,7 @@ def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -
 
 
 @pytest.mark.long
-def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -> None:
+def test_drops_of_a_killed_process_stay_counted(path: Path) -> None:
     graph = robot(
         f"slow: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{queue: newest, size: 1, {AGAIN}}}}}",
         count=250,

@@ -250,7 +250,7 @@ def test_an_operator_with_other_ports_than_recorded_is_named(recorded: Path) -> 
         verify(recorded, graph=replace(graph, nodes={**graph.nodes, "smooth": more}))
 
 
-def test_what_was_not_recorded_for_one_operator_is_made_again(recorded: Path, tmp_path: Path) -> None:
+def test_unrecorded_inputs_of_an_operator_are_recomputed(recorded: Path, tmp_path: Path) -> None:
     path = rewritten(recorded, tmp_path / "thin.mcap", stored=lambda stream, seq: stream != "test/mix/mixed")
 
     report = verify(path, only=["smooth"])

@@ -220,7 +220,7 @@ def test_setting_up_is_no_part_of_the_time_of_a_re_execution(recorded: Path, mon
     assert 0.0 < work.wall < 100.0
 
 
-def test_what_an_operator_held_is_found_without_reading_the_whole_recording(
+def test_held_messages_are_found_without_reading_the_whole_recording(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph = load_graph(HERE / "chaos.yaml", settings=["count=120"])

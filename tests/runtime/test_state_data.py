@@ -189,7 +189,7 @@ def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: 
     assert later.state.window.length == length
 
 
-def test_parts_with_settings_are_restored_where_they_are_and_made_by_their_owner_where_not() -> None:
+def test_state_parts_with_settings_are_restored_in_place() -> None:
     one, other = Ringing(), Ringing()
     one.process(number(1))
     first, second = other.state.rings
@@ -402,7 +402,7 @@ def test_a_state_is_seen_in_the_collections_that_it_declares() -> None:
     assert found["spare"] == ()
 
 
-def test_what_a_class_does_not_declare_is_seen_as_it_is() -> None:
+def test_undeclared_state_is_shown_unchanged() -> None:
     packed = {"tracks": [[1, 2]], "other": [[1, 2]], "seen": ["a"]}
 
     assert seen(State, packed) == {"tracks": [[1, 2]], "other": [[1, 2]], "seen": {"a"}}

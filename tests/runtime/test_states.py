@@ -84,7 +84,7 @@ def test_numbers_of_numpy_come_back_as_arrays_without_dimensions() -> None:
         ({"names": np.array(["a", None], object)}, "state.names is a ndarray"),
     ],
 )
-def test_what_cannot_be_kept_is_named_with_its_place(state: dict[str, Any], words: str) -> None:
+def test_unpackable_state_is_refused_with_its_place(state: dict[str, Any], words: str) -> None:
     with pytest.raises(StateError, match=words):
         pack_state(state)
 

@@ -261,7 +261,7 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
-def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_not_replayed(memory: Path) -> None:
+def test_recording_lacking_inputs_of_actuators_is_completed_not_replayed(memory: Path) -> None:
     parts = (
         "left: {SOURCE}",
         "arm: {use: simulation.operators:Arm, inputs: {x: left/fast}}",
@@ -408,7 +408,7 @@ def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
     assert small.count == 1
 
 
-def test_what_fails_otherwise_is_a_broken_promise_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_exception_is_a_violation_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulation.check._verify", lambda *_: 1 // 0)
 
     with pytest.raises(Violation, match="ZeroDivisionError"):

@@ -71,7 +71,7 @@ def test_stopped_process_blocks_no_sender_and_reads_the_latest_message(
     assert answer(channel) == ("last", {"frontier": 4999})
 
 
-def test_what_cannot_be_replaced_is_bounded(stopped: tuple[QueuedChannel, subprocess.Popen[bytes]]) -> None:
+def test_queue_of_irreplaceable_messages_is_bounded(stopped: tuple[QueuedChannel, subprocess.Popen[bytes]]) -> None:
     channel, _ = stopped
 
     for _ in range(50):

@@ -149,7 +149,7 @@ def test_the_first_death_ends_the_run_with_how_far_it_was_and_its_last_words() -
     assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: process 'sum' was killed")
 
 
-def test_what_fails_because_of_a_failure_is_noted_and_the_first_cause_stays() -> None:
+def test_consequent_failure_is_noted_and_the_first_cause_stays() -> None:
     play = Play().starts()
     play.deaf.add("left")
     play.tell(play.failed("sum", "fire at stamp 5"))
@@ -338,7 +338,7 @@ def test_failure_details_hold_output_of_the_late_process_and_no_old_output_of_ot
     assert "[left] left 0" not in details
 
 
-def test_what_a_process_has_left_behind_is_named() -> None:
+def test_processes_left_behind_are_named() -> None:
     play = Play().starts()
     play.tell(LeftBehind(("sum",), ("sleep (process 12)",)), LeftBehind(("left", "sum"), ("cat (process 13)",)))
     assert play.ends().notes == (
@@ -363,7 +363,7 @@ def test_after_the_end_nothing_is_commanded() -> None:
     assert [c for c in play.commands if isinstance(c, Over)] == [play.over]
 
 
-def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> None:
+def test_progress_between_polling_rounds_invalidates_the_proof() -> None:
     """Everybody is idle, and as much was received as sent, in every round."""
     play = Play().starts()
     play.state = {"sent": 5, "received": 5}

@@ -282,7 +282,7 @@ def test_one_that_drops_nothing_catches_up_first_since_nothing_else_bounds_what_
     assert covered(play, 1100)[1] == 300
 
 
-def test_what_did_not_reach_a_consumer_is_counted_against_it() -> None:
+def test_gap_at_a_consumer_is_counted_as_its_drops() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     gap = {"stream": "test/left/fast", "first": 10, "following": 15}
     play.tell(play.progress("sum", {"sum": 9}), Said("sum", "gap", gap), play.progress("sum", {"sum": 20}))
@@ -473,7 +473,7 @@ def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
     assert play.failure() == "interrupted while process 'smooth' was to be started again"
 
 
-def test_what_did_not_drain_because_a_process_is_silent_is_laid_to_that() -> None:
+def test_incomplete_draining_is_attributed_to_the_silent_process() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     play.tell(play.progress("sum", {"sum": 9}))
     play.wait(1.0)
@@ -594,7 +594,7 @@ def told(firings: int, dropped: int, timeouts: int) -> Said:
     return Said("smooth", "progress", {"done": {}, "counts": counts, "drops": drops, "waits": waits})
 
 
-def test_what_an_operator_did_before_its_restarts_counts_with_what_it_does_now() -> None:
+def test_counts_of_an_operator_span_its_restarts() -> None:
     play = robot().starts()
     play.tell(told(2, 1, 1), told(5, 4, 2))
     for _ in range(2):

@@ -88,7 +88,7 @@ def opened(made: RunPlan) -> Iterator[Mapping[str, Descriptors]]:
     links.close()
 
 
-def test_what_one_end_of_a_link_sends_arrives_at_the_other() -> None:
+def test_messages_sent_on_a_link_arrive() -> None:
     with opened(plan(record=Path("run.mcap"))) as handed:
         for keys, link in handed["smooth"].outgoing:
             link.send(0, [keys[0].encode()], len(keys[0]))

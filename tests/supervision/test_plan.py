@@ -67,7 +67,7 @@ def test_each_stream_goes_to_the_processes_that_take_it() -> None:
     assert not any(p.has_log or p.firings or p.sink for p in found.values())
 
 
-def test_what_stays_within_a_process_is_not_sent() -> None:
+def test_streams_within_a_process_are_not_published() -> None:
     found = plans(placement={"left": "a", "smooth": "a", "sum": "b", "other": "b"})
     assert {label: (p.nodes, p.publish, p.subscribe) for label, p in found.items()} == {
         "a": (("left", "smooth"), {FAST: 1, MEAN: 1}, ()),

@@ -52,7 +52,7 @@ def test_a_join_that_was_forced_to_pass_over_an_anchor_has_decided_it() -> None:
     assert aligner.drops == {("a", "unmatched"): 1, ("b", "late"): 1}
 
 
-def test_what_has_been_promised_downstream_is_decided() -> None:
+def test_messages_up_to_the_promised_output_frontier_are_late() -> None:
     aligner = Aligner(AlignSpec((A,)))
     aligner.force("a", 100)
     assert aligner.output_frontier() == 100

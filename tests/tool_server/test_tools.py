@@ -236,7 +236,7 @@ def test_that_nothing_differs_or_was_lost_is_an_answer(bugs: dict[str, str], tmp
     assert told["told"].startswith("nothing was lost")
 
 
-def test_what_if_the_code_or_a_parameter_were_another(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_if_reruns_with_changed_code_or_parameter(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZOO_FIXED", "1")
     told = ask("what_if", bugs["wrong"], operator="sum", call=str(SKIPPED), show="after['total']")
 
@@ -339,7 +339,7 @@ def test_each_tool_reports_calls_that_could_not_be_made(torn: str) -> None:
     assert told["not_made"] == {"sum": "51 of 701 calls could not be made again (bugs/src/x #650 is not recorded)"}
 
 
-def test_what_follows_a_cut_is_not_called_identical() -> None:
+def test_verdict_of_a_cut_recording_is_identical_up_to_the_cut() -> None:
     whole = Verification("whole", firings=3, verified=3)
     torn = Verification("torn", firings=5, verified=3, unverifiable=2, beyond=2, cut=True, missing="x #3")
     report = VerifyReport((whole, torn), (), (), 0, 0, 0.0, 0.0)

@@ -146,7 +146,7 @@ def test_where_nothing_may_be_lost_all_of_the_pool_may_be_held() -> None:
     shared.close()
 
 
-def test_what_a_consumer_held_that_was_replaced_is_free(shared: Shared) -> None:
+def test_memory_held_by_a_replaced_consumer_is_freed(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     shared.outgoing[0].take_leave(1)
     shared.consumers[0] = shared.consumer(life=2)

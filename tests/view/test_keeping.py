@@ -34,7 +34,7 @@ def test_a_cell_counts_once_and_only_when_it_was_seen_often_enough() -> None:
     assert seen == [[], [], [[1.01, 0.0, 0.0]], [], [], []]
 
 
-def test_what_moves_leaves_no_points() -> None:
+def test_moving_objects_leave_no_kept_points() -> None:
     kept = KeptPoints(step=0.05, after=3)
     moving = [drawn(kept, t, [[0.1 * t, 0.0, 0.0], [0.0, 5.0, 0.0]]) for t in range(20)]
     assert [point for found in moving for point in found] == [[0.0, 5.0, 0.0]]

@@ -373,7 +373,7 @@ def test_scores_of_operators_without_outputs_have_a_panel(tmp_path: Path) -> Non
     assert "Scores" in [row.values[0] for row in blueprint_rows(path) if row.component.endswith("display_name")]
 
 
-def test_what_an_operator_found_wrong_stands_before_the_scores() -> None:
+def test_findings_precede_the_scores() -> None:
     maker, judge = (
         Node(name, "nowhere:Nothing", {}, {}, outputs, Live("newest", 1, {}))
         for name, outputs in (("calibration", {"status": "r/calibration/status"}), ("score", {}))

@@ -149,7 +149,7 @@ def test_a_motion_is_believed_where_no_other_one_explains_as_much(other: Registe
     assert bool(found.reason) is ambiguous
 
 
-def test_what_lies_on_a_surface_does_not_hang_in_free_space() -> None:
+def test_coarse_floor_voxels_do_not_violate_free_space() -> None:
     """Coarse voxels of a wide floor, seen at a low angle, lie before what is seen in directions beside theirs."""
     boxes = np.array([[x, y, 0.6, 0.4, 0.4, 0.6] for x in (-6, -2, 3, 7) for y in (-3, 3.5)])
     A, B = at(0.2, 0.1, 0.0), at(2.5, 0.1, 0.3)

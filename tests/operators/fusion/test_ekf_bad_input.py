@@ -120,7 +120,7 @@ def test_inertial_sample_without_covariance_takes_the_last_one() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_whatever_a_pose_holds_the_estimate_stays_finite(data: st.DataObject) -> None:
+def test_estimate_stays_finite_for_arbitrary_poses(data: st.DataObject) -> None:
     number = st.floats(allow_nan=True, allow_infinity=True, width=32)
     position = data.draw(st.lists(number, min_size=3, max_size=3))
     covariance = np.array(data.draw(st.lists(number, min_size=36, max_size=36))).reshape(6, 6)

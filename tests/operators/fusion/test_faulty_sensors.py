@@ -178,7 +178,7 @@ def test_fixes_later_than_the_window_are_counted_and_a_warning_names_them() -> N
     assert "robot/fix" not in Run(drive, drive.fixes(late=0.5)).alarms
 
 
-def test_what_was_measured_before_the_filter_began_is_not_too_late() -> None:
+def test_measurements_before_the_filter_start_are_not_late() -> None:
     drive = Drive(2.0)
     run = Run(drive, drive.fixes(late=0.3))
     assert run.operator.summary()["ignored, robot/fix: before the beginning"] == 3

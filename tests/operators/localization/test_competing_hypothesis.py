@@ -65,7 +65,7 @@ def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
-def test_what_makes_the_ends_differ_decides(seed: int) -> None:
+def test_asymmetry_resolves_the_ambiguous_hall(seed: int) -> None:
     drive = HallDrive(5.0, notch=True, seed=seed)
     played, _ = localized(drive, {"scan": drive.scans()})
     assert len(played["pose"]) > 50

@@ -178,7 +178,7 @@ def test_the_number_of_particles_follows_the_spread() -> None:
     assert played["particles"][-1].count < 250
 
 
-def test_what_cannot_be_used_is_counted_with_its_reason() -> None:
+def test_unusable_measurements_are_counted_by_reason() -> None:
     drive = Drive(1.0)
     empty = PointCloud(stamp=100_000_000, frame="base_link", points=np.full((20, 3), np.nan))
     strange = LandmarkSightings(

@@ -72,7 +72,7 @@ def test_a_table_stays_taken_though_it_is_seen_over_and_under() -> None:
     assert 0 <= cell(grid, 0.6, 0.02) < 50
 
 
-def test_what_went_away_becomes_free() -> None:
+def test_cells_of_a_removed_object_become_free() -> None:
     post = np.column_stack([np.full(8, 1.02), np.zeros(8), 1.02 * np.tan(np.linspace(-0.25, 0.25, 8))])
     clouds = [cloud(np.concatenate([post, walls()])), *(cloud(walls(), k) for k in range(2, 15))]
     played = mapped(clouds, [pose(stamp=k) for k in range(1, 15)])

@@ -122,7 +122,7 @@ def test_two_doors_between_the_same_rooms_are_two() -> None:
     np.testing.assert_allclose(np.sort(rooms.door_positions[:, 1]), [2.9, 5.25], atol=0.06)
 
 
-def test_what_stands_free_is_no_wall() -> None:
+def test_free_standing_objects_are_no_walls() -> None:
     """Chairs in the middle leave passages as narrow as doors."""
     plan = FloorPlan(4.5, 6.5).rooms((0.5, 0.5, 3.5, 6.0))
     for x in (0.9, 1.8, 2.7):

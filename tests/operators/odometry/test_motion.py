@@ -40,7 +40,7 @@ def test_a_blind_motion_dies_out_alike_however_frames_divide_the_time() -> None:
     assert 0.16 + 0.8 * 0.05 < ways[0] < later < 0.16 + 0.8 * DECAY
 
 
-def test_the_spread_of_a_prediction_is_that_of_the_acceleration_over_the_whole_blind_time() -> None:
+def test_prediction_spread_grows_with_the_blind_time_squared() -> None:
     motion, sum_ = steady(TWIST), np.zeros(6)
     for k in (2, 3, 5, 8):
         sum_ += np.sqrt(np.diag(motion.spread(k * TENTH, 3.0, 7.0)))

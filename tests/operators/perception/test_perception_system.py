@@ -192,7 +192,7 @@ def test_no_detection_of_a_detector_of_ones_own_is_lost(room: Room) -> None:
     assert set(result.tracks.labels()) == {"book"}
 
 
-def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None:
+def test_mismatched_input_is_refused_and_the_system_continues(room: Room) -> None:
     (first, given), (second, following) = list(room.given("image", "depth"))[:2]
     image, depth = given["image"].data, given["depth"].data
     wrong: list[tuple[type[Exception], str, int, dict[str, Any]]] = [

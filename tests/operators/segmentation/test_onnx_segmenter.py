@@ -230,7 +230,7 @@ def test_void_pixels_are_not_painted_and_maps_of_other_images_are_refused() -> N
         (NAMED, {"output": "logits"}, "has no output 'logits'; it has planes"),
     ],
 )
-def test_what_does_not_fit_is_named(
+def test_mismatched_input_is_refused_with_the_mismatch(
     tmp_path: Path, metadata: dict[str, str], params: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(OperatorFailure, match=words):

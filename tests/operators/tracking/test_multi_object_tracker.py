@@ -92,7 +92,7 @@ def test_the_joined_track_has_the_older_id_whichever_of_the_two_goes_on(younger:
     assert ids(tracked([*both, *one])[-1], TrackState.CONFIRMED, TrackState.COASTING) == [1]
 
 
-def test_what_was_seen_apart_goes_on_by_weak_boxes_beside_another() -> None:
+def test_separate_tracks_continue_by_weak_boxes_when_they_meet() -> None:
     """Two enter together, one before the other, part, and meet again: the hidden one has weak boxes then."""
     images = [image(k, [walker(100), walker(118 + 12 * k)]) for k in range(5)]
     images += [image(k, [walker(100), walker(166 - 12 * (k - 4), 0.8 if k < 7 else 0.2)]) for k in range(5, 12)]

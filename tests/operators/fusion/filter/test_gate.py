@@ -107,9 +107,7 @@ def test_frozen_position_stays_frozen_at_rest_until_it_changes() -> None:
 
 
 @pytest.mark.parametrize(("sigma", "idle"), [(0.01, False), (0.2, True)])
-def test_a_body_that_has_braked_since_may_stand_at_the_place_and_one_that_may_drive_on_may_not(
-    sigma: float, idle: bool
-) -> None:
+def test_repeated_place_after_braking_may_be_standstill(sigma: float, idle: bool) -> None:
     first = repeat_of(Repeat(PLACE, 0), measured(0.2, Position(PLACE, ZERO)), state_of(0.8), fits=True)
     second = repeat_of(first, measured(0.4, Position(PLACE, ZERO)), state_of(0.01, sigma), fits=True)
     assert ((second.speed > 0), second.frozen) == (idle, False)

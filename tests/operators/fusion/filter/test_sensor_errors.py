@@ -92,7 +92,7 @@ def test_an_unobservable_drift_keeps_its_spread() -> None:
 
 
 @pytest.mark.parametrize("kind", ["drift", "scale"])
-def test_what_an_error_does_to_a_residual_is_its_jacobian(kind: str) -> None:
+def test_jacobians_of_sensor_errors_match_differences(kind: str) -> None:
     errors = SensorErrors((("a", 0.1),), (("fix", (1.0, 1.0, 1.0), 9.0),), (("wheels", 0.01),))
     rng = np.random.default_rng(0)
     model = (

@@ -147,7 +147,7 @@ def test_poses_that_do_not_come_after_the_last_are_counted() -> None:
     assert operator.summary()["ignored, camera/pose: stamp not later than the last"] == 2
 
 
-def test_what_can_never_be_fused_is_refused_by_name() -> None:
+def test_unfusable_poses_are_refused_with_the_stream() -> None:
     operator = PoseFusion()
     operator.setup()
     pose = poses(1, np.random.default_rng(0))[0]

@@ -157,7 +157,7 @@ def test_an_error_before_a_pose_and_one_behind_it_are_the_same_error() -> None:
     np.testing.assert_allclose(np.cov(np.array(left).T), expected, atol=0.3 * expected.max())
 
 
-def test_what_a_scan_holds_errs_as_the_map_does_and_the_rest_as_the_last_pose_and_the_motion() -> None:
+def test_constrained_directions_take_the_map_covariance_and_others_the_predicted_one() -> None:
     of_map, of_last, spread = 1e-4 * np.eye(6), 4e-2 * np.eye(6), 1e-2 * np.eye(6)
     held = np.diag([0.0, 1e6, 1e6, 1e6, 1e6, 1e6])  # nothing along x
     covariance, own = corrected(np.eye(4), held, spread, of_map, of_last)

@@ -105,7 +105,7 @@ def test_corner_point_averages_keyframe_depths_and_contradicted_ones_are_dropped
     np.testing.assert_array_equal(blind.points, kept.points)
 
 
-def test_new_corners_are_those_that_have_depth_and_do_not_move_beside_those_that_are_kept() -> None:
+def test_new_corners_have_depth_are_static_and_apart_from_kept_ones() -> None:
     kept, still = Corners(PLACES[:1], at(2.0)[:1], np.array([4])), Movers.none(K, (240, 320))
     depth = wall(2.0)
     depth[:, 200:] = 0.0

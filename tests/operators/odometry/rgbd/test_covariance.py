@@ -125,7 +125,7 @@ def test_standing_still_adds_nothing() -> None:
     np.testing.assert_allclose(carried(known, np.eye(4))[0], known.covariance, atol=1e-18)
 
 
-def test_what_sinks_goes_on_sinking() -> None:
+def test_vertical_drift_accumulates_linearly() -> None:
     """Over two steps twice as far, so four times the variance, not two times."""
     known = replace(first_keyframe(), covariance=np.zeros((6, 6)))
     step = se3.exp(np.array([0, 0, 0.2, 0, 0, 0]))

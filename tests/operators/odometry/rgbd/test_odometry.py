@@ -532,7 +532,7 @@ def test_a_keyframe_is_made_whenever_the_view_has_changed_by_a_tenth_of_a_radian
     assert keyframes_of(turning(0.0)) == [0]
 
 
-def test_a_view_with_depth_takes_the_place_of_one_that_has_little_and_not_the_other_way_round() -> None:
+def test_view_with_depth_replaces_a_keyframe_with_little_only() -> None:
     frames, _ = sequence(25)
     narrow = [(g, np.where(np.arange(SIZE[0]) > 0.3 * SIZE[0], np.float32(0), d)) for g, d in frames]
     assert keyframes_of([narrow[0], *frames[1:4]])[:2] == [0, 1]
@@ -576,7 +576,7 @@ def mover_sequence(count: int) -> Sequence:
 
 
 @pytest.mark.long
-def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
+def test_moving_object_does_not_disturb_the_pose() -> None:
     frames, poses = mover_sequence(25)
     results = follow(frames, rate=10.0)
     steps = [

@@ -124,7 +124,7 @@ def looks(graphs: list[SceneGraph], *likely: str) -> list[Classification]:
     ]  # fmt: skip
 
 
-def test_what_a_posture_looks_like_counts_beside_motion_unless_it_is_switched_off() -> None:
+def test_posture_counts_beside_motion_unless_switched_off() -> None:
     mug: Box = 4, "mug", (0.45, 0.2, 0.75), (0.09, 0.09, 0.1)
     table: Box = 6, "table", (0.7, 0.0, 0.0), (0.6, 1.2, 0.75)
     graphs = course(4, lambda t: [person(0.0, 0.0), mug, table])

@@ -132,7 +132,7 @@ def test_a_learned_object_is_read_as_it_was_written(learned: Path, tmp_path: Pat
     np.testing.assert_array_equal(copy.direction, known.direction)
 
 
-def test_what_varies_everywhere_does_not_tell_an_object() -> None:
+def test_uninformative_feature_axis_gets_little_weight() -> None:
     """The first axis differs most but at random; the second tells."""
     rng = np.random.default_rng(0)
 

@@ -182,7 +182,7 @@ def test_a_person_walks_to_a_chair_and_sits_down() -> None:
     assert (9, "sitting_on", 3) in relations(played["graph"][-1])
 
 
-def test_what_a_hand_has_is_held() -> None:
+def test_object_in_a_hand_is_held() -> None:
     cup: Thing = (2, "mug", (1.65, -2, 1.2), (0.1, 0.08, 0.1))
     found = relations(built([[TABLE, cup, person(1.4, -2)]] * 6)["graph"][-1])
     assert (9, "holding", 2) in found

@@ -48,7 +48,7 @@ def test_goal_of_a_path_is_symmetric_in_left_and_right(side: int) -> None:
     assert max(found, key=lambda i: found[i]) == 2
 
 
-def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
+def test_goal_added_later_is_judged_by_the_earlier_path() -> None:
     """Doors left and right, equally far from who has come from the left: that to the left was left behind."""
     left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
     inference, walk = GoalInference(), [0.2 * k for k in range(6)]

@@ -89,7 +89,7 @@ def test_there_is_one_floor_and_its_height_is_that_of_most_of_it() -> None:
         top(0, 3.2),  # at it
     ],
 )
-def test_what_has_another_plane_side_or_place_is_another_surface(other: SeenSurface) -> None:
+def test_another_plane_side_or_place_is_another_surface(other: SeenSurface) -> None:
     assert len(mapped([[wall(0, 2), other]] * 3).confirmed) == 2
 
 

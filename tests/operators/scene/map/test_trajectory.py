@@ -21,7 +21,7 @@ def motion(x: float, y: float, yaw: float) -> np.ndarray[Any, np.dtype[np.float6
     return T
 
 
-def test_what_was_seen_between_two_keyframes_moves_by_what_lies_between_their_corrections() -> None:
+def test_correction_is_interpolated_between_keyframes() -> None:
     correction = Correction([0, 1000], np.stack([np.eye(4), motion(1.0, 0, 0.2)]))
     np.testing.assert_allclose(correction.at(-5), np.eye(4))
     np.testing.assert_allclose(correction.at(500)[:2, 3], [0.5, -0.025], atol=0.001)
