@@ -29,7 +29,7 @@ def test_vectors_scalars_and_timestamps_are_arrays(recording: dataflow.RecordedS
     assert imu["frame"].tolist() == ["imu"] * 11
 
 
-def test_columns_are_what_the_messages_hold(recording: dataflow.RecordedStreams) -> None:
+def test_columns_equal_the_message_fields(recording: dataflow.RecordedStreams) -> None:
     for stream in recording.select("imu", "image", "objects", "info").values():
         for name in stream.fields:
             values = [getattr(message, name) for message in stream]

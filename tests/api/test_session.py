@@ -61,7 +61,7 @@ def test_session_step_returns_no_undecided_messages(run: dataflow.RunResult) -> 
         assert session.put(first.stamp + 1, {}) == {}
 
 
-def test_an_input_that_does_not_fit_is_refused_and_the_session_goes_on(run: dataflow.RunResult) -> None:
+def test_session_refuses_a_mismatched_input_and_continues(run: dataflow.RunResult) -> None:
     first, second = run.open()["image"][:2]
     with dataflow.Session(small(), static=statics(run)) as session:
         session.put(first.stamp, {"camera/image": first})

@@ -50,7 +50,7 @@ def test_values_of_several_kinds_differ_by_their_content() -> None:
     assert differ(1, 1.0, 0.5)
 
 
-def test_a_nudge_weighs_as_much_as_the_whole_of_a_number_and_other_content_stands_behind() -> None:
+def test_link_weight_combines_nudges_and_replaced_content() -> None:
     def weighed(value: object, *effects: tuple[Way, object]) -> tuple[float, float]:
         return chain(value).weight(link(TARGET, None, *(Effect(way, (), after) for way, after in effects)))
 

@@ -47,7 +47,7 @@ def captured(path: Path, operator: str = "bug", number: int | None = None, predi
         return capture(recording, Debugger(recording, operator), number, predicate).captured
 
 
-def test_a_captured_call_comes_back_from_its_file(late: Path) -> None:
+def test_captured_call_survives_its_file(late: Path) -> None:
     made = captured(late)
     read = Captured.from_bytes(made.to_bytes())
 

@@ -151,7 +151,7 @@ def test_source_on_which_a_repeating_operator_depends_is_named(cause: str) -> No
 
 
 @pytest.mark.parametrize("cause", [MONOTONIC, ADDRESSES])
-def test_a_source_by_which_runs_agree_by_chance_is_found_past_the_log_and_beside_others(cause: str) -> None:
+def test_cause_with_agreeing_runs_is_found_beside_other_causes(cause: str) -> None:
     """The difference of two readings of a clock, rounded to 10 ms, is 0 in two quiet runs."""
     operator = Repeating({cause, ENTROPY, HEAP}, reads={WALL, GAIN})
 

@@ -158,7 +158,7 @@ def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_be
     assert not _Alone.is_newer(alone, str(copied), Verification("x"))
 
 
-def test_changed_code_is_reported_before_what_the_results_also_depend_on() -> None:
+def test_changed_code_is_reported_before_other_dependencies() -> None:
     gain = Cause("environment variable:GAIN", (Site("/robot/op.py", 20, "setup", "os.environ"),), 1)
     console = Console(file=io.StringIO(), width=200)
 

@@ -66,7 +66,7 @@ def test_a_graph_that_comes_with_dataflow_is_named_for_a_bag_too(dataflow, bag: 
 
 
 @pytest.mark.long
-def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_path: Path) -> None:
+def test_star_within_a_part_matches_any_characters(dataflow, recorded, tmp_path: Path) -> None:
     told = dataflow("filter", recorded[0], "--stream", "left/*st", "-o", tmp_path / "part.mcap", "--json").stdout
 
     assert "test/left/fast" in told
@@ -101,7 +101,7 @@ def test_a_recording_may_be_converted_in_its_place(dataflow, recorded, tmp_path:
 
 
 @pytest.mark.parametrize("command", ["latency", "verify", "diff"])
-def test_a_ros_1_bag_where_a_recording_is_expected_is_answered_with_what_makes_one(
+def test_ros_1_bag_in_place_of_a_recording_is_refused_with_the_conversion(
     dataflow, tmp_path: Path, command: str
 ) -> None:
     from made_bags import ROS1

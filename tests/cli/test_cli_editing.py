@@ -74,7 +74,7 @@ def test_recover_saves_a_torn_file_and_reports_it(dataflow, recorded: Recorded, 
     assert "no file" in dataflow("recover", tmp_path / "none.mcap", "-o", saved, code=2).stderr
 
 
-def test_a_bag_that_is_no_mcap_is_answered_with_what_makes_one(dataflow, tmp_path: Path) -> None:
+def test_bag_that_is_no_mcap_is_refused_with_the_conversion(dataflow, tmp_path: Path) -> None:
     bag = tmp_path / "drive.bag"
     bag.write_bytes(b"#ROSBAG V2.0\n")
 

@@ -29,7 +29,7 @@ def running(small: Path) -> Iterator[Background]:
 
 
 @pytest.mark.usefixtures("running")
-def test_list_shows_the_running_graph_and_who_takes_its_streams(dataflow) -> None:
+def test_list_shows_the_running_graph_and_its_consumers(dataflow) -> None:
     told = dataflow("list").stdout
     assert f"namespace test, process {os.getpid()}" in told
     assert "smooth.x, gripper.x" in told
@@ -128,7 +128,7 @@ def test_hz_prints_the_rate_by_stamp(dataflow) -> None:
     assert "left/fast" in told
 
 
-def test_rates_over_a_window_forget_what_came_before() -> None:
+def test_rates_over_a_window_ignore_earlier_messages() -> None:
     rate = _Rate()
     for second in range(10):  # ten a second stamped, one a second by the clock, until the last two
         rate.seen.append((float(second), second * 10**8, second, 100))
@@ -172,7 +172,7 @@ def test_trigger_without_flight_recorder_and_invalid_playback_words_are_refused(
 
 
 @pytest.mark.usefixtures("running")
-def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
+def test_run_is_paused_stepped_and_resumed(dataflow) -> None:
     assert dataflow("playback", "pause").stdout.startswith("paused at ")
     before = json.loads(dataflow("playback", "status", "--json").stdout)
     assert before["paused"]
@@ -185,7 +185,7 @@ def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
     assert "as fast as it goes" in told
 
 
-def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
+def test_view_follows_the_graph_to_its_end_and_saves_it(dataflow, running: Background, tmp_path: Path) -> None:
     """The last test of the file: it ends the graph."""
     saved = tmp_path / "live.rrd"
     threading.Timer(1.0, running.supervisor.stop).start()

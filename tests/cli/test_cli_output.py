@@ -173,7 +173,7 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     assert "wrote   out/run.mcap (1 message, 5.0 MB)" in lines
 
 
-def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
+def test_progress_without_a_start_shows_no_duration() -> None:
     console = Console(file=io.StringIO(), width=100)
     with shown(console, RunDisplay(console), quiet=False) as watch:
         assert watch is not None
@@ -288,7 +288,7 @@ def test_scores_of_many_operators_are_one_of_each_and_no_lists() -> None:
     assert printed(report)[1] == "scores  score_0: iou 0.5; score_1: iou 0.5; score_2: iou 0.5; score_3: iou 0.5"
 
 
-def test_parts_of_the_runtime_are_called_what_they_are() -> None:
+def test_runtime_processes_are_printed_by_their_role() -> None:
     operators = {"@log": OperatorCounts(100, 100, 0, 0, 0)} | dict(lossy_report().operators)
     report = replace(lossy_report(), operators=operators)
     status = Status(waiting=("@log", "odometry", "@recorder"))

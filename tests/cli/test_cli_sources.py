@@ -344,7 +344,7 @@ def test_files_of_a_folder_that_are_no_parts_of_one_are_not_read_as_one(dataflow
     dataflow("info", tmp_path)
 
 
-def test_python_warns_of_what_a_file_lacks(tmp_path: Path) -> None:
+def test_python_api_warns_of_damaged_files(tmp_path: Path) -> None:
     graph = tmp_path / "g.yaml"
     graph.write_text(GRAPH)
     with pytest.warns(UserWarning, match="no proper end"), api.open(torn(tmp_path / "a.mcap")):

@@ -228,7 +228,7 @@ def test_each_recording_counts_once_whatever_its_name_and_its_parts(folder: Path
     assert sorted(source.name for source in found) == ["alone.mcap", "caf\\udce9.mcap", "gap", "parted"]
 
 
-def test_a_failure_is_kept_with_what_it_printed_and_the_others_go_on(sweep: Sweep, tmp_path: Path) -> None:
+def test_failed_run_keeps_its_error_and_the_others_continue(sweep: Sweep, tmp_path: Path) -> None:
     words = ("--set", "scaled.fail_at=5,1e9")
     told = sweep(*words, recordings="runs/first.mcap", code=1)
 

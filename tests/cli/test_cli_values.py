@@ -70,14 +70,14 @@ def both(words: list[str]) -> tuple[Any, Any]:
         ["--flag", "--word", ""],
     ],
 )
-def test_a_word_means_what_typer_makes_of_it(words: list[str]) -> None:
+def test_word_is_parsed_as_by_typer(words: list[str]) -> None:
     plain, checked = both(words)
 
     assert repr(plain) == repr(checked)  # 1 is not 1.0, nan is nan
 
 
 @given(option=st.sampled_from(["--whole", "--part", "--clock"]), word=st.text("0123456789.-+_e auto", max_size=18))
-def test_numbers_and_choices_mean_what_typer_makes_of_them(option: str, word: str) -> None:
+def test_numbers_and_choices_are_parsed_as_by_typer(option: str, word: str) -> None:
     plain, checked = both([f"{option}={word}"])
 
     assert repr(plain) == repr(checked)

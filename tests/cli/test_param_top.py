@@ -292,7 +292,7 @@ def test_metrics_are_those_of_the_operators() -> None:
 
 
 @pytest.mark.long
-def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, alone: Tunable) -> None:
+def test_unresponsive_process_is_shown_until_it_resumes(dataflow, alone: Tunable) -> None:
     process = alone.process_of("tuned")
     process.send_signal(signal.SIGSTOP)
     try:

@@ -47,9 +47,7 @@ def said(more: dict[str, Any], **of: Any) -> str:
         ({}, {}, "its code, of which the recording has no digests"),
     ],
 )
-def test_the_report_names_what_changed_or_that_all_is_as_recorded(
-    of: dict[str, Any], more: dict[str, Any], sentence: str
-) -> None:
+def test_report_names_changes_or_none(of: dict[str, Any], more: dict[str, Any], sentence: str) -> None:
     assert sentence in said(more, **of)
 
 

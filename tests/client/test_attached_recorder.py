@@ -92,9 +92,7 @@ def test_split_files_hold_everything_once_and_static_messages_each(
             assert recording.counts("test/left/constant") == {0: 1}
 
 
-def test_a_static_message_that_is_larger_than_a_file_may_be_does_not_split_at_each_message(
-    graph: Graph, tmp_path: Path
-) -> None:
+def test_static_message_above_the_size_limit_does_not_split_at_every_message(graph: Graph, tmp_path: Path) -> None:
     streams = ["test/smooth/mean", "test/left/constant"]
     large = FeatureVector(stamp=0, vectors=np.random.default_rng(1).random((1, 2_000), np.float32), model="m")
     split = Splitting(size=2_000)

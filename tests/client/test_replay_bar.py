@@ -45,7 +45,7 @@ def bar(replay: Replay) -> ReplayBar:
     return ReplayBar(replay, replay.ask(None))
 
 
-def test_it_pauses_and_goes_on_without_changing_a_speed_that_was_not_touched(replay: Replay, bar: ReplayBar) -> None:
+def test_pause_and_resume_keep_the_speed(replay: Replay, bar: ReplayBar) -> None:
     assert bar.state() == (True, FIRST + 2 * 10**9, 1.0)
     assert bar.request(playing=False, speed=1.0, seek=None) is None
     assert bar.state()[0] is False

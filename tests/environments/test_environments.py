@@ -310,7 +310,7 @@ def test_an_environment_is_asked_once_until_it_changes(tmp_path: Path) -> None:
     assert asked() == 2
 
 
-def test_an_environment_that_cannot_serve_is_refused_with_what_would_be_right(tmp_path: Path) -> None:
+def test_unusable_environment_is_refused_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(EnvError, match=r"no environment: .*bin/python is missing; `.* -m venv .*none` makes one"):
         environment_of(str(tmp_path / "none"))
 

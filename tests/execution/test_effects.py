@@ -121,7 +121,7 @@ def test_recorded_answers_are_given_again_without_a_call() -> None:
     assert next(WORLD) == before + 1
 
 
-def test_numbers_drawn_behind_a_call_do_not_depend_on_what_it_drew() -> None:
+def test_random_draws_after_an_effect_are_independent_of_it() -> None:
     ran = recorded(lambda operator, x: operator.effect(ask) + random.random() + operator.rng.random())
 
     assert again(ran).result.verdict == "identical"
@@ -358,7 +358,7 @@ def test_calls_may_be_left_out_or_made_in_another_order() -> None:
     assert swapped.result.verdict == "identical"
 
 
-def test_answers_are_in_the_run_what_they_are_in_a_re_execution() -> None:
+def test_effect_answers_are_equal_in_run_and_reexecution() -> None:
     seen: list[Any] = []
     given = {"list": (1, [2.5, None]), "array": np.arange(6, dtype=np.int16).reshape(2, 3), "bytes": b"\x00"}
 

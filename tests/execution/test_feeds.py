@@ -39,7 +39,7 @@ def test_window_fills_by_messages_or_bytes_and_empties_when_covered() -> None:
     assert not window.full
 
 
-def test_event_time_goes_on_at_its_rate_and_from_where_it_was_put(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_event_time_advances_at_its_rate_from_its_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=50.0)
     fake = SimpleNamespace(time=lambda: clock.now, time_ns=lambda: round(clock.now * 1e9))
     monkeypatch.setattr("dataflow.execution.feeds.pace.time", fake)

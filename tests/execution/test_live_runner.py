@@ -47,7 +47,7 @@ def test_a_static_trigger_of_a_merge_is_waited_for_without_working() -> None:
     assert not runner.timeouts
 
 
-def test_a_wait_that_is_given_up_is_no_drop_and_what_comes_late_is_counted() -> None:
+def test_timeout_is_no_drop_and_late_messages_are_counted() -> None:
     runner, _collector = live(node(Either, {"a": ["t/s/a"], "b": ["t/s/b"]}))
 
     runner.push("t/s/a", entry("t/s/a", 100, 0))
@@ -202,7 +202,7 @@ def fired(collector: Collector) -> list[int]:
     return [r.stamp for r in collector.records if r.kind == "fire"]
 
 
-def test_an_operator_that_samples_itself_fires_at_once_when_its_own_promise_decides() -> None:
+def test_self_sampling_operator_fires_once_its_frontier_decides() -> None:
     waits = {"x": None, "last": None, "rest": None}
     runner, collector, ready = looped(queue="newest", size=16, wait=waits)
     runner.advance("t/s/rest", 1_000)

@@ -17,7 +17,7 @@ from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, Offer, _ste
 from dataflow.execution.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
-def test_paused_holds_everything_until_it_goes_on() -> None:
+def test_pause_holds_playback_until_resumed() -> None:
     playback = Playback(paused=True)
     assert playback.holds
     playback.do("toggle")
@@ -104,7 +104,7 @@ def test_keys_match_the_help_text(typed: bytes, meant: list[str]) -> None:
     ],
     ids=["flight recorder", "no flight recorder", "live"],
 )
-def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
+def test_terminal_keys_control_playback_and_restore_the_terminal(
     monkeypatch: pytest.MonkeyPatch, offers: tuple[Offer, ...], meant: list[str]
 ) -> None:
     master, slave = pty.openpty()

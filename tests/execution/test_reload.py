@@ -150,7 +150,7 @@ def _fire(runner: LiveRunner, stamp: int) -> None:
         ("sum_to_reload", CODE + "\n    def setup(self):\n        while True: pass\n", r"not over within 0\.05 s"),
     ],
 )
-def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
+def test_unfit_reloaded_code_is_refused_and_the_old_continues(
     folder: Path,
     running: tuple[LiveRunner, Collector],
     module: str,
@@ -204,7 +204,7 @@ def test_state_unfit_for_reloaded_code_is_reset(folder: Path, running: tuple[Liv
     assert collector.kinds() == ["setup", "fire", "setup", "fire"]
 
 
-def test_an_operator_that_has_failed_goes_on_with_new_code_at_once(
+def test_failed_operator_resumes_at_once_with_reloaded_code(
     folder: Path, running: tuple[LiveRunner, Collector]
 ) -> None:
     runner, collector = running

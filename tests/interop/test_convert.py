@@ -73,7 +73,7 @@ STATIC = ("camera/image_info", "camera/depth_info", "tf")
 
 
 @pytest.mark.parametrize("kind", sorted(OUTWARD, key=lambda t: t.SCHEMA), ids=lambda t: t.SCHEMA)
-def test_message_goes_to_ros_and_comes_back_through_serialised_bytes(kind: type[Message]) -> None:
+def test_message_survives_the_round_trip_through_ros_bytes(kind: type[Message]) -> None:
     if kind.SCHEMA == "CompressedDepth":
         pytest.skip("its example has a scale of its own; the depth formats are tested apart")
     store = typestore()

@@ -56,7 +56,7 @@ def arm(frames: int = 6) -> dict[str, list[Message]]:
     return {"camera/image": images, "arm/joints": joints, "cmd/twist": commands, "said": [Text(stamp=START, text="go")]}
 
 
-def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: Path) -> None:
+def test_lerobot_frame_holds_an_image_with_the_newest_other_messages(tmp_path: Path) -> None:
     streams_of = arm()
 
     path = of_robot(tmp_path / "a.mcap", streams_of)
@@ -153,7 +153,7 @@ def test_a_lerobot_dataset_of_format_3_locates_its_episodes(tmp_path: Path) -> N
     ]
 
 
-def test_a_stream_whose_messages_change_in_size_is_named_with_what_leaves_it_out(tmp_path: Path) -> None:
+def test_stream_of_varying_size_is_named_with_the_option_to_omit_it(tmp_path: Path) -> None:
     streams = arm()
     longer = JointState(stamp=START + 11 * SECOND // 10, names=("a", "b", "c"), positions=np.zeros(3))
     late = Image(stamp=START + 12 * SECOND // 10, frame="c", data=np.zeros((12, 16, 3), np.uint8))

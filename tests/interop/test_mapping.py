@@ -15,7 +15,7 @@ IMAGE, DEPTH = wanted("camera/image", "Image"), wanted("camera/depth", "DepthIma
 LEFT, RIGHT = wanted("camera/left", "Image"), wanted("camera/right", "Image")
 
 
-def test_types_alone_settle_what_leaves_no_choice() -> None:
+def test_unambiguous_types_settle_the_mapping() -> None:
     topics = [Offered("/rgb", ("Image",), 5), Offered("/d", ("CompressedDepth", "DepthImage"), 5)]
 
     found = propose([IMAGE, DEPTH], topics, {})

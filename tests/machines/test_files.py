@@ -21,7 +21,7 @@ def sent(folder: Path, content: bytes) -> str:
     return digest
 
 
-def test_the_copy_of_an_earlier_run_does_not_stand_in_for_a_file_that_is_gone(tmp_path: Path) -> None:
+def test_copy_of_an_earlier_run_does_not_replace_a_missing_file(tmp_path: Path) -> None:
     digest = sent(tmp_path, b"old")
     parameters = [{"layers": [{"weights": WEIGHTS}], "rate": 30}]
 

@@ -34,7 +34,7 @@ def test_agent_that_left_the_run_or_restarted_is_detected() -> None:
     assert claims.answer("robot", b"2", "", LONG, 44.0) == "anew"
 
 
-def test_the_claim_of_an_agent_that_is_gone_before_it_joined_lapses() -> None:
+def test_claim_of_an_agent_that_never_joined_expires() -> None:
     claims = Claims("run")
     claims.answer("robot", b"1", "", None, 0.0)
     assert claims.answer("robot", b"2", "", None, LONG) == "offer"

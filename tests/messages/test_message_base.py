@@ -138,7 +138,7 @@ def test_a_message_cannot_be_changed() -> None:
         message.points[0, 0] = 1
 
 
-def test_replace_changes_only_what_it_names() -> None:
+def test_replace_changes_only_the_named_fields() -> None:
     message = Probe(stamp=0, text="a", points=POINTS)
     changed = message.replace(text="b")
     assert (changed.text, changed.stamp, message.text) == ("b", 0, "a")
@@ -197,7 +197,7 @@ def test_error_names_the_field_and_the_expected_value(values: dict[str, object],
         Probe(**({"stamp": 0, "points": POINTS} | values))
 
 
-def test_a_field_cannot_hide_what_every_message_has() -> None:
+def test_field_cannot_shadow_a_message_attribute() -> None:
     with pytest.raises(MessageError, match=r"Hiding\.digest: every message has 'digest' already"):
         type("Hiding", (Message,), {"digest": scalar("str", "x")})
 

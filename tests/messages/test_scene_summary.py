@@ -96,7 +96,7 @@ def test_intentions_of_any_likelihood_are_listed_likeliest_first() -> None:
     assert not told.telling
 
 
-def test_people_come_with_what_they_do_and_a_ball_beside_them_is_what_moves() -> None:
+def test_people_are_summarized_with_activities_and_the_ball_as_a_mover() -> None:
     scene = graph("ball person chair", (1, "heads_for", 2, 0.76), (0, "on", 2, 0.9))
     acts = Activity(
         stamp=0, class_names=("walking", "resting"), subjects=np.array([2, 1]),
@@ -117,7 +117,7 @@ def test_carried_objects_are_grouped_by_class_and_single_ones_listed_on_the_floo
     assert [(row.name, row.text) for row in rows] == [("table 2", "on it 2 books; in it mug 5"), ("floor 0", "lamp 6")]
 
 
-def test_agents_are_what_acts_whatever_its_class() -> None:
+def test_agents_are_determined_by_acting_not_by_class() -> None:
     scene = graph("zorb mug table", (0, "holding", 1, 0.9), (1, "on", 2, 0.9))
     assert summarize(scene).agents == {0}
     acts = Activity(

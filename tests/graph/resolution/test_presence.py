@@ -82,7 +82,7 @@ def test_the_first_way_that_is_there_is_taken_also_through_exported_outputs() ->
     assert "outer/part/cloud" not in outer("", more).aliases
 
 
-def test_a_file_that_names_what_its_own_omission_removes_has_a_fault() -> None:
+def test_input_from_a_left_out_operator_is_a_fault() -> None:
     more = '  echo: {use: "graph_operators:Mapper", inputs: {cloud: part/cloud, pose: part/pose}}\n'
     assert faults("", more) == [
         "echo.cloud: 'part/cloud' is not made: part is not given its input 'cloud'; part is not given its input 'depth'"

@@ -104,7 +104,7 @@ def test_the_digest_of_large_arrays_is_the_documented_one(first: int, second: in
     assert message.digest() == documented_digest(message)
 
 
-def test_the_constructor_accepts_and_refuses_what_the_general_one_does() -> None:
+def test_compiled_constructor_agrees_with_the_general_one() -> None:
     for cls, seed in itertools.product(TYPES, (0, 2)):
         values = dict(example(cls, seed).items())
         for name in values:

@@ -33,7 +33,7 @@ def room(seed: int = 0) -> np.ndarray:
     return points * [2, 2, 1]
 
 
-def test_range_and_box_keep_what_lies_in_them() -> None:
+def test_range_and_box_keep_the_points_inside() -> None:
     points = [[0.1, 0, 0], [1, 0, 0], [3, 0, 0], [0, 1, 0], [9, 0, 0], [np.nan, 0, 0], [np.inf, 0, 0]]
     box = {"lower": (0.5, -0.5, -0.5), "upper": (20.0, 0.5, 0.5)}
     out, counts = filtered(cloud(points), min_range=0.5, max_range=5.0, **box)

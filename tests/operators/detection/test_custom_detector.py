@@ -569,7 +569,7 @@ def test_boxes_follow_the_pixels_through_every_variation(tmp_path: Path, seed: i
     np.testing.assert_allclose(seen.boxes[0], around, atol=1.01)
 
 
-def test_without_variation_training_sees_what_the_operator_sees(tmp_path: Path) -> None:
+def test_training_without_variation_sees_the_operators_input(tmp_path: Path) -> None:
     from operators.image.letterbox import Fit
 
     for size, target in (((640, 480), (320, 240)), ((200, 120), (160, 128)), ((100, 160), (160, 128))):
@@ -655,7 +655,7 @@ def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = 
     return file, network
 
 
-def test_the_file_computes_what_the_trained_network_computes(tmp_path: Path) -> None:
+def test_exported_file_agrees_with_the_trained_network(tmp_path: Path) -> None:
     file, network = exported(tmp_path)
     pixels = scene(4)[0]
     with torch.inference_mode():

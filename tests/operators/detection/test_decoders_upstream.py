@@ -323,7 +323,7 @@ def test_rows_that_fill_up_an_export_are_no_objects(tmp_path: Path) -> None:
         ("tensorflow", {"a": np.zeros((1, 3, 9), np.float32)}, r"outputs of TensorFlow's detectors"),
     ],
 )
-def test_outputs_of_another_family_are_refused_with_what_would_be_right(
+def test_outputs_of_another_model_family_are_refused_with_a_hint(
     tmp_path: Path, decoder: str, outputs: dict[str, np.ndarray], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=reason):

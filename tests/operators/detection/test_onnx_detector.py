@@ -148,7 +148,7 @@ def test_a_decoder_that_does_not_fit_the_model_is_named(tmp_path: Path) -> None:
         made.process(red())
 
 
-def test_the_name_of_a_model_stands_for_its_file_and_is_what_the_record_holds() -> None:
+def test_model_name_resolves_to_its_file_and_is_recorded() -> None:
     named, made = detector(model="simulated"), CustomDetector()
     made.setup()
     rng = np.random.default_rng(0)

@@ -267,7 +267,7 @@ def test_a_detector_with_a_refiner_repeats_itself_and_keeps_to_its_threshold(ref
     assert (few.scores >= 0.3).all()
 
 
-def test_the_file_computes_what_the_trained_network_computes(refined: Refined) -> None:
+def test_exported_file_agrees_with_the_trained_network(refined: Refined) -> None:
     plain, file, data = refined
     task = RefinerTask(data, plain, variation=GENTLE)
     task.network.load_state_dict(load_safely(file.with_suffix(".refiner.pt"))["ema"])

@@ -81,7 +81,7 @@ def test_odometry_without_velocity_counts_by_its_steps() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"use": "doppler", "sigma": 0.03}, {"sigma": 0.03}], ids=["doppler", "auto"])
-def test_radar_gives_the_velocity_and_what_moves_is_refused(settings: dict[str, Any]) -> None:
+def test_radar_measures_velocity_and_moving_detections_are_refused(settings: dict[str, Any]) -> None:
     robot = Robot()
     sensors = {"robot/radar": settings}
     operator, played = fused({"robot/imu": robot.imu, "robot/radar": robot.scans()}, start="origin", sensors=sensors)

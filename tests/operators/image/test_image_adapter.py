@@ -123,7 +123,7 @@ def test_status_reports_measurements_and_corrections() -> None:
     assert second.pairs(0) == {"images": "2", "made brighter": "1", "noise removed": "1"}
 
 
-def test_a_restored_adapter_goes_on_counting() -> None:
+def test_restored_adapter_continues_counting() -> None:
     first, second = ImageAdapter(), ImageAdapter()
     first.setup()
     second.setup()

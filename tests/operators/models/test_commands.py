@@ -107,7 +107,7 @@ def test_get_replaces_a_damaged_file(one: Served, cache: Path) -> None:
     assert run("get", "net")[0] == 1
 
 
-def test_get_of_a_damaged_file_that_is_exported_names_what_to_do(
+def test_get_of_a_damaged_exported_file_names_the_remedy(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(registry.REGISTRIES, write_row(tmp_path / "own.yaml", model_of(CONTENT, export="make it")))

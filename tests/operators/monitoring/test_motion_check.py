@@ -177,7 +177,7 @@ def test_of_two_it_is_open_which_is_wrong_and_wheels_still_pass() -> None:
     assert len(played["checked"]) == len(wheels())
 
 
-def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_check_continues_identically() -> None:
     by_stamp: dict[int, dict[str, Odometry]] = {}
     for name, messages in (
         ("wheels", wheels(1.05)), ("camera", odometry("camera", 10, 1)), ("lidar", odometry("lidar", 20, 2)),

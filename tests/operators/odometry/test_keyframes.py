@@ -36,9 +36,7 @@ def test_views_differ_by_baseline_over_depth_and_by_angle() -> None:
     ],
     ids=["two near each other", "in a row", "of equal ones the first but one", "not among the newest", "no other"],
 )
-def test_the_keyframe_whose_neighbours_see_nearly_what_it_sees_makes_room(
-    places: list[float], recent: int, expected: int
-) -> None:
+def test_most_redundant_keyframe_is_dropped(places: list[float], recent: int, expected: int) -> None:
     assert redundant([at(x) for x in places], recent) == expected
 
 

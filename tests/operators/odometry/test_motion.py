@@ -32,7 +32,7 @@ def test_a_steady_motion_is_predicted_to_go_on() -> None:
     np.testing.assert_allclose(motion.predict(3 * TENTH, DECAY), se3.exp(0.3 * TWIST), atol=1e-12)
 
 
-def test_a_blind_motion_dies_out_alike_however_frames_divide_the_time() -> None:
+def test_blind_motion_decays_independently_of_the_frame_rate() -> None:
     ways = [blind(steady(AHEAD), *frames).T_world_camera[0, 3] for frames in [(2, 3, 4, 5, 6), (2, 6), (2, 4, 6)]]
     assert ways == pytest.approx([ways[0]] * 3)
     before = blind(steady(AHEAD), 2, 6)

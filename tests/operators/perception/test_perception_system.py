@@ -124,7 +124,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
 
 
 @pytest.mark.long
-def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
+def test_missing_sensor_disables_only_its_dependents(room: Room) -> None:
     with room.system(("image", "depth", "imu", "wheels")) as system:
         for stamp, step in room.given("image", "depth", "imu", "wheels"):
             whole = system.process(stamp, **step)

@@ -69,9 +69,7 @@ def test_a_network_of_torchvision_describes_without_its_head(tmp_path: Path) -> 
     np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=1), 1.0, rtol=1e-5)
 
 
-def test_an_embedding_by_name_describes_what_text_describes_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_named_embedding_describes_images_and_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_MODELS", str(write_row(tmp_path)))
     monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path / "cache"))
     shown = image(

@@ -42,7 +42,7 @@ def test_memory_resets_on_another_model_and_forgets_old_vectors() -> None:
     assert answers[-1] == {2: [0, 1]}, "2 was described before 1 and 3, so it is begun anew"
 
 
-def test_means_repeat_and_a_restored_memory_goes_on() -> None:
+def test_restored_feature_memory_continues_identically() -> None:
     assert_repeats(FeatureMemory, [(vectors(1, {4: (1, 0)}),), (vectors(2, {4: (0, 1)}),)], 1)
 
 

@@ -88,7 +88,7 @@ def in_image(second: int, ids: list[int]) -> Detections2D:
     )  # fmt: skip
 
 
-def test_a_map_must_have_what_was_plainly_seen_by_then_and_movers_while_they_are_in_view() -> None:
+def test_map_must_contain_plainly_seen_objects_and_visible_movers() -> None:
     """The table (12) is seen from the third second on, the ball (13) up to the fourth, the mug (11) always."""
     seen, must = PlainlySeen(images=3), []
     labels = LabelSpace.read(Path(labels_file("simulator")))

@@ -129,7 +129,7 @@ def test_a_network_that_takes_bytes_is_given_the_pixels(tmp_path: Path) -> None:
         segmented(model=model, mean=(0.5, 0.5, 0.5))
 
 
-def test_blue_comes_first_where_the_network_wants_it(tmp_path: Path) -> None:
+def test_bgr_networks_get_blue_first(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS[:, ::-1], metadata=NAMED)
     other = save(tmp_path / "n.onnx", WEIGHTS, metadata=NAMED)
     np.testing.assert_array_equal(segmented(model=model, bgr=True).classes, segmented(model=other).classes)
@@ -156,7 +156,7 @@ def test_one_channel_is_a_class_and_its_background(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-margin)), atol=1e-4)
 
 
-def test_a_letterboxed_image_comes_back_without_its_border(tmp_path: Path) -> None:
+def test_letterboxed_segmentation_is_cropped_to_the_image(tmp_path: Path) -> None:
     # 64x24 in 32x24: 32x12 with 6 rows of grey above and below; scores are proportional to the pixel, so to the image.
     model = save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED)
     seen, plain = image(64, 24), {"mean": (0, 0, 0), "std": (1, 1, 1)}

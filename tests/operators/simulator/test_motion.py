@@ -45,7 +45,7 @@ def test_the_robot_stands_still_at_first_and_starts_without_a_jerk() -> None:
     assert np.abs(np.diff(motion.acceleration, axis=0)).max() < 0.05
 
 
-def test_the_path_closes_and_heading_goes_on() -> None:
+def test_path_closes_and_heading_accumulates() -> None:
     path = Trajectory(OVAL)
     first, again = path.at([1.0]), path.at([1.0 + path.period])
     np.testing.assert_allclose(again.position, first.position, atol=1e-9)

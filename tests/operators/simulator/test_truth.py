@@ -334,7 +334,7 @@ def grasp_of(person: Person) -> Any:
     return next((act.grasp for act in person.timeline.acts if act.grasp is not None), None)
 
 
-def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
+def test_contacts_follow_the_activities_of_persons(robot: SimulatedRobot) -> None:
     world = robot._stage.world
     drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and grasp_of(t.mover) is not None]
     assert drinkers

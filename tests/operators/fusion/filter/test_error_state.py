@@ -84,7 +84,7 @@ def test_a_jacobian_is_the_derivative_of_its_residual(model: Model) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
-def test_a_measurement_comes_back_from_a_snapshot(model: Model) -> None:
+def test_measurement_is_restored_from_a_snapshot(model: Model) -> None:
     again = typed(Model, unpack_state(pack_state({"model": plain(model)}))["model"])
     assert type(again) is type(model)
     one, other = (m.innovation(state(1), np.ones(3)) for m in (model, again))

@@ -211,7 +211,7 @@ def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and
 
 
 @pytest.mark.parametrize("heading", [0.0, None])
-def test_a_snapshot_goes_on_with_equal_bits(heading: float | None) -> None:
+def test_restored_filter_continues_bit_for_bit(heading: float | None) -> None:
     made = Made(3.0)
     one = made.filter(heading=heading)
     half = 70

@@ -71,7 +71,7 @@ def test_a_drift_taken_for_noise_makes_the_covariance_too_small_and_a_state_does
     assert 1.0 < held < 6.0  # its 95 % band is 1.4-5.3 over six
 
 
-def test_a_position_is_no_surer_than_its_drift_and_comes_back_from_a_snapshot() -> None:
+def test_position_covariance_is_bounded_by_the_drift_and_restored() -> None:
     config = FilterConfig(errors=SensorErrors(drifts=(("fix", (DRIFT, DRIFT, 2 * DRIFT), 1000.0),)))
     filter = driven(1, config.errors)
     sigmas = np.sqrt(np.diag(filter.estimate(filter.time)[0].covariance)[:3])
@@ -140,7 +140,7 @@ def test_settings_enable_error_states_and_reduce_the_noise() -> None:
     assert noise[0, 0] == pytest.approx(0.025)
 
 
-def test_settings_without_errors_leave_the_state_as_it_was() -> None:
+def test_settings_without_errors_add_no_error_states() -> None:
     assert errors_of({"robot/fix": SensorSettings()}).sigmas == []
 
 

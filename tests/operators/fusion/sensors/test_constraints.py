@@ -124,7 +124,7 @@ def test_no_slip_constraint_reduces_drift() -> None:
     assert count(operator, "slip, used") > 150
 
 
-def test_slip_is_bounded_ten_times_a_second_beside_what_rolls() -> None:
+def test_slip_constraint_is_applied_at_10_hz() -> None:
     at = np.eye(4)
     at[:3, :3], at[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0.2, 0.3]  # the base looks along the body's y
     constraints = Constraints(None, 0.02)

@@ -42,7 +42,7 @@ def laid(axes: tuple[int, ...], T: Array, start: Array) -> Fit:
     return fit(scan, planes, prior, lambda T: np.zeros(6), 0.02)
 
 
-def test_a_scan_between_walls_is_laid_where_it_was_taken() -> None:
+def test_scan_between_walls_is_registered_at_its_pose() -> None:
     found = laid((0, 1, 2), TRUTH, np.eye(4))
     assert np.abs(se3.log(invert(TRUTH) @ found.T)).max() < 2e-3
     assert found.blind.shape == (0, 6)
@@ -120,7 +120,7 @@ def test_poses_agree_by_how_many_points_lie_on_planes() -> None:
 # -- the motion --------------------------------------------------------------------------------------------------
 
 
-def test_a_motion_goes_on_for_as_long_as_the_patience_and_then_stands() -> None:
+def test_predicted_motion_stops_after_the_patience() -> None:
     velocity = np.array([1.0, 0.2, 0.0, 0.0, 0.0, 0.5])
     motion = LidarMotion(2 * SECOND, TRUTH, velocity, np.zeros((6, 6)), fresh=False)
     np.testing.assert_allclose(motion.predicted(2 * SECOND + SECOND // 2, 0.8), TRUTH @ se3.exp(0.5 * velocity))

@@ -119,7 +119,7 @@ def test_an_adjustment_puts_the_newest_keyframes_and_what_they_saw_in_their_plac
     np.testing.assert_allclose(adjusted.points[right], POINTS[right], atol=5e-3)
 
 
-def test_a_map_that_is_resized_sees_what_it_saw() -> None:
+def test_rescaled_map_keeps_its_projections() -> None:
     known, centre = whole(3), np.array([0.3, -0.2, 1.0])
     known = replace(known, views=tuple(replace(v, covariance=np.eye(6)) for v in known.views))
     larger, metric = known.resized(2.5, centre), known.in_metres(2.5, centre)

@@ -70,7 +70,7 @@ def test_the_larger_surface_stands_still_though_most_corners_are_on_something_ne
     assert where[:, 0].min() > 115
 
 
-def test_most_corners_stand_still_where_what_moves_is_no_farther() -> None:
+def test_majority_of_corners_decides_the_static_scene() -> None:
     points, pixels = seen(corners(110, 130, 310, 1.5, 1), corners(60, 10, 110, 1.5, 2))
     found = followed(points, pixels)
     assert off(found) < 0.01

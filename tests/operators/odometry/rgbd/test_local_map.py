@@ -77,7 +77,7 @@ def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifte
     assert sure == [3, 2]
 
 
-def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanwhile() -> None:
+def test_relocalized_camera_does_not_use_keyframes_passed_while_drifting() -> None:
     known = LocalMap(20)
     known.add(replace(keyframe(1), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
     known.add(keyframe(0))
@@ -171,7 +171,7 @@ def test_movers_are_detected_by_the_oldest_recent_keyframe_that_shares_the_view(
     assert known.earlier(keyframe(60).T_world_camera, 0) == []
 
 
-def test_a_map_that_is_full_forgets_what_others_make_up_for_and_keeps_the_newest() -> None:
+def test_full_map_drops_redundant_keyframes_and_keeps_the_newest() -> None:
     known = LocalMap(8)
     for number in (0, 4, 8, 12, 13, 14, 15, 16, 17, 18):
         known.add(keyframe(number))

@@ -338,7 +338,7 @@ def after_a_second(
     return odometry.track(*frames[22], int(20e9 / 30) + 1_000_000_000), poses[22]
 
 
-def test_a_track_across_a_gap_gives_way_to_a_place_that_more_speaks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_track_across_a_gap_yields_to_a_better_supported_place(monkeypatch: pytest.MonkeyPatch) -> None:
     result, truth = after_a_second(monkeypatch, (0.03, 0.0, 0.0))
     assert result.status in MEASURED
     assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
@@ -392,7 +392,7 @@ def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64])
     return replace(state, motion=wrong, map=known, trials=with_trial(state.trials, trial))
 
 
-def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
+def test_wrong_relocalization_is_withdrawn_on_contradiction() -> None:
     frames, poses = sequence(25, 3.0)
     odometry = RgbdOdometry(camera())
     for i in range(9):
@@ -541,7 +541,7 @@ def test_view_with_depth_replaces_a_keyframe_with_little_only() -> None:
     assert keyframes_of([*turned[:1], *poor[1:4], *turned[4:6]]) == [0, 4]
 
 
-def test_parameters_are_by_default_what_settings_are() -> None:
+def test_default_parameters_equal_the_default_settings() -> None:
     assert VisualOdometry()._config() == RgbdOdometryConfig()
 
 
@@ -588,7 +588,7 @@ def test_moving_object_does_not_disturb_the_pose() -> None:
 
 
 @pytest.mark.long
-def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keyframes_exclude_moving_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = mover_sequence(25)
     odometry, fits = RgbdOdometry(camera()), []
     refine = Fitter.refine

@@ -98,7 +98,7 @@ def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() ->
     assert np.ptp(lengths) < 0.003
 
 
-def test_a_window_counts_for_what_it_shows_of_the_offset() -> None:
+def test_window_informs_the_offset_by_its_motion() -> None:
     """A camera that stands still cannot tell near points of one offset from farther ones of another."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(8, 40, 60)])

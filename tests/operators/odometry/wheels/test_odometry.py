@@ -173,7 +173,7 @@ def test_after_a_gap_the_end_is_known_less() -> None:
 
 
 @pytest.mark.parametrize("kind", ["positions", "velocities"])
-def test_joints_give_what_ticks_give(kind: str) -> None:
+def test_joint_states_and_ticks_give_equal_odometry(kind: str) -> None:
     rolled = steady(0.5, 0.3, 3.0)
     values = rolled / RADIUS if kind == "positions" else np.repeat([[0.5 - 0.06, 0.5 + 0.06]], len(rolled), 0) / RADIUS
     joints = [

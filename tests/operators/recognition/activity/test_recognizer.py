@@ -146,7 +146,7 @@ def test_looks_of_another_time_change_nothing() -> None:
     assert play(Recognizer(), given).digests() == play(Recognizer(), {"nodes": graphs}).digests()
 
 
-def test_a_posture_that_speaks_against_motion_does_not_outweigh_it_at_once() -> None:
+def test_contradicting_posture_does_not_outweigh_motion_at_once() -> None:
     graphs = course(6, lambda t: [person(0.65 * t, 0.0, length=0.8)])
     names = ["walking"] * (len(graphs) - 1) + ["standing"]
     found = play(Recognizer(), {"nodes": graphs, "postures": looks(graphs, *names)})["activities"]

@@ -124,7 +124,7 @@ def test_files_that_are_no_learned_objects_or_of_another_detector_are_refused(le
         play(LearnedDetector(objects=[str(strange)]), {"image": [image(scenery(0, sign=True)[0])]})
 
 
-def test_a_learned_object_is_read_as_it_was_written(learned: Path, tmp_path: Path) -> None:
+def test_learned_object_survives_its_file(learned: Path, tmp_path: Path) -> None:
     known = LearnedObject.read(learned)
     known.write(tmp_path / "copy.npz")
     copy = LearnedObject.read(tmp_path / "copy.npz")

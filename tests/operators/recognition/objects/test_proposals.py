@@ -20,7 +20,7 @@ def trunk() -> Trunk:
     return Trunk(DETECTOR, inner_maps(DETECTOR))
 
 
-def test_inner_maps_come_beside_outputs_that_stay_what_they_are(trunk: Trunk) -> None:
+def test_trunk_maps_accompany_unchanged_outputs(trunk: Trunk) -> None:
     glance = trunk.look(PIXELS)
     assert [m.shape[1:] for m in glance.trunk] == [(72, 96), (36, 48), (18, 24)]
     network = open_network(DETECTOR, "detector")

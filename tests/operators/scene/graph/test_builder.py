@@ -101,7 +101,7 @@ def test_flat_object_lies_on_a_slightly_offset_plane(below: float, lies: bool) -
     assert {o for s, p, o in found if s == 8 and p == "on"} == ({1, -11} if lies else set())
 
 
-def test_a_table_top_without_a_table_carries_what_stands_on_it() -> None:
+def test_tabletop_without_a_table_carries_its_objects() -> None:
     found = first(MUG, TOP)
     assert found[2, "on", -11] > 0.6
     assert not any(s == -11 for s, _, _ in found)
@@ -261,7 +261,7 @@ def test_nodes_keep_the_tracks_that_are_theirs() -> None:
     assert held == {"mug 2": (5, 9), "table 1": (4,)}
 
 
-def test_graphs_repeat_and_a_restored_builder_goes_on() -> None:
+def test_restored_builder_continues_identically() -> None:
     rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
     assert_repeats(Builder, [(room(k, things), robot(k)) for k, things in enumerate(rooms)], 10)
 

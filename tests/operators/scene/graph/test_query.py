@@ -56,7 +56,7 @@ def graph(stamp: int = 1_000_000_000) -> SceneGraph:
         ("person on table", []),
     ],
 )
-def test_a_question_finds_what_fits(question: str, ids: list[int]) -> None:
+def test_query_finds_the_matching_nodes(question: str, ids: list[int]) -> None:
     made = graph()
     assert [int(made.ids[m.node]) for m in ask(made, question)] == ids
 
@@ -259,7 +259,7 @@ def colors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def test_any_text_ranks_the_nodes_by_what_it_means(tmp_path: Path, colors: Path) -> None:
+def test_free_text_ranks_the_nodes_by_meaning(tmp_path: Path, colors: Path) -> None:
     file = embedded(tmp_path)
     _, out = asked(str(file), "--query", "something red to drink from", "--json")
     matches = [(m["id"], m["score"]) for m in json.loads(out[out.index("{") :])["matches"]]

@@ -113,7 +113,7 @@ def test_questions_reports_and_exports_know_the_rooms() -> None:
     assert (layers["building"], layers["room 1"], layers["table 1"]) == (5, 4, 2)
 
 
-def test_without_rooms_the_graph_is_as_it_was() -> None:
+def test_graph_without_rooms_is_unchanged() -> None:
     graph = last(play(Builder(), {"nodes": [scene_graph([TABLE, CHAIR], stamp=STEP)]}))
     assert graph.areas is None
     assert {"room", "floor"} <= set(graph.names())

@@ -63,7 +63,7 @@ def test_a_wall_that_shows_through_a_chairs_back_is_not_the_chair(slats: int) ->
     assert set(seen.points[found.points, 2]) == {2.0}
 
 
-def test_a_cup_before_what_a_box_is_around_is_not_the_box_thing() -> None:
+def test_cup_in_front_of_a_boxed_object_is_excluded_from_it() -> None:
     seen = behind_slats(4)
     seen.points[:] *= 3.0 / seen.points[:, 2:]
     cup = (np.abs(seen.pixels - [320, 240]) <= 15).all(axis=1)

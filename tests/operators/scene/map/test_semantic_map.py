@@ -130,7 +130,7 @@ def test_a_view_without_points_is_survived() -> None:
     assert ids(last(mapped(given))) == [1]
 
 
-def test_maps_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_semantic_map_continues_identically() -> None:
     assert_repeats(partial(SemanticMap, labels=MUGS_MOVE), views([[CRATE, OTHER]] * 8), 4)
 
 

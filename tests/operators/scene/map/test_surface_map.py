@@ -171,6 +171,6 @@ def test_surfaces_of_another_time_are_not_used_and_of_another_frame_are_refused(
         known.process(**view_of_a_table(3 * SECOND, surfaces(3 * SECOND).replace(frame="lidar")))
 
 
-def test_a_restored_map_goes_on_with_its_surfaces() -> None:
+def test_restored_map_continues_with_its_surfaces() -> None:
     calls = [view_of_a_table(k * SECOND, surfaces(k * SECOND)) for k in range(1, 5)]
     assert_repeats(partial(SemanticMap, labels="simulator"), calls, 3)

@@ -120,7 +120,7 @@ def test_operator_without_identities_resumes_alike(half: int) -> None:
     assert_resumes_alike(LandmarkSlam, list(zip(messages["odometry"], messages["sightings"], strict=True)), half)
 
 
-def test_the_status_is_given_every_second_and_names_what_was_done() -> None:
+def test_status_is_sent_every_second_with_counts() -> None:
     result = play(LandmarkSlam(association="unknown"), Walk(2).messages(known=False))
     stamps = [status.stamp for status in result["status"]]
     assert len(stamps) >= 10

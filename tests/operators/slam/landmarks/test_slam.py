@@ -117,7 +117,7 @@ def test_pose_and_map_are_near_the_truth_and_their_covariances_are_honest() -> N
     assert 1.2 < np.mean(distances) < 3.2  # 2 degrees of freedom
 
 
-def test_covariances_may_be_read_without_a_change_of_what_follows() -> None:
+def test_reading_covariances_does_not_change_the_filter() -> None:
     walk, read, plain = Walk(3), LandmarkFilter(), LandmarkFilter()
     for k, (ids, points) in enumerate(walk.seen[:70]):
         for made in (read, plain):
@@ -179,7 +179,7 @@ def test_parts_of_a_step_make_the_whole(x: float, y: float, turn: float, share: 
     np.testing.assert_allclose(_arc(step, share) @ rest, whole, atol=1e-9)
 
 
-def test_the_operator_gives_what_the_filter_gives() -> None:
+def test_operator_output_equals_the_filter() -> None:
     walk = Walk(7)
     result = play(LandmarkSlam(), walk.messages())
     pose, made = result["pose"][-1], walk.filtered()
