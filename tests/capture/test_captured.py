@@ -73,9 +73,7 @@ def test_a_predicate_about_any_call_is_captured(late: Path) -> None:
     assert made.shots[0].firing.inputs["rare"] == ()  # not needed for that
 
 
-def test_a_state_that_holds_the_bug_is_begun_with_only_where_the_calls_are_too_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_capture_starts_from_a_state_only_with_too_many_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = seeded_bugs.recorded(bugs.Case(bugs.Drifts), tmp_path / "run.mcap")
 
     made = captured(path)

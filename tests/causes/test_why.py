@@ -147,7 +147,7 @@ def test_facts_of_the_machine_are_no_change_of_an_operator() -> None:
     assert made.altered("x") == ("code of op", "numpy 1 → 2", "cpu: a → b")
 
 
-def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_before(tmp_path: Path) -> None:
+def test_file_copied_with_its_times_is_newer_than_an_earlier_recording(tmp_path: Path) -> None:
     copied = tmp_path / "cfg.json"
     copied.write_text("{}")
     os.utime(copied, (1.0, 1.0))

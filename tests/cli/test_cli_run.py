@@ -155,7 +155,7 @@ def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("asked", ["0", "1"])
-def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_asked_for(
+def test_damaged_recording_is_one_line_and_the_traceback_optional(
     damaged: Path, monkeypatch: pytest.MonkeyPatch, asked: str
 ) -> None:
     monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
@@ -224,7 +224,7 @@ class Reader(Source):
 """
 
 
-def test_data_that_is_not_there_is_one_line_and_the_parameter_that_names_other_data(dataflow, tmp_path: Path) -> None:
+def test_missing_data_is_one_line_with_the_parameter_to_set(dataflow, tmp_path: Path) -> None:
     (tmp_path / "absent_reader.py").write_text(ABSENT)
     (tmp_path / "absent.yaml").write_text(
         f"graph: absent\noperators:\n  camera: {{use: 'absent_reader:Reader', params: {{path: {tmp_path}/nowhere}}}}\n"

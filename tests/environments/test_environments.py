@@ -95,7 +95,7 @@ def test_the_standard_library_of_this_installation_is_not_that_of_an_environment
     assert sysconfig.get_path("purelib") in path
 
 
-def test_a_verification_repeats_each_operator_in_its_environment_and_names_other_versions(
+def test_verification_runs_operators_in_their_environments_and_names_other_versions(
     recorded: Path, environments: Path
 ) -> None:
     report = verify(recorded)
@@ -126,7 +126,7 @@ def thin(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unverifiable(thin: Path) -> None:
+def test_operator_in_another_environment_than_its_producer_is_unverifiable(thin: Path) -> None:
     report = verify(thin)
 
     assert {v.operator: (v.verdict, v.missing) for v in report.operators} == {
@@ -137,9 +137,7 @@ def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unveri
         verify(thin, only=["second"])
 
 
-def test_an_operator_whose_environment_is_not_here_stops_the_verification_of_no_other(
-    recorded: Path, environments: Path
-) -> None:
+def test_missing_environment_does_not_stop_the_verification_of_others(recorded: Path, environments: Path) -> None:
     (environments / "two").rename(environments / "away")
     try:
         report = verify(recorded)
@@ -181,7 +179,7 @@ def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, r
 
 
 @pytest.mark.long
-def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs_there(
+def test_call_is_captured_and_tested_in_the_environment_of_its_operator(
     recorded: Path, environments: Path, tmp_path: Path
 ) -> None:
     with other_version(environments):
@@ -253,9 +251,7 @@ def test_a_fix_is_proven_by_calls_in_the_environment_of_its_operator(recorded: P
         answer("prove", {**asked, "expect": "1 = 2"}, said.append)
 
 
-def test_another_operator_is_judged_although_its_recorded_code_cannot_be_tried_here(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_operator_is_judged_without_its_recorded_code(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Difference(4, "fire", 0, "y", "aa", "bb")
     second = Verification("second", 20, 20, first=first, own_fault=True, code_changed=["env_operators"])
     report = VerifyReport((second,), (), (), 0, 0, 0.0, 0.0, repeated={"second": True})

@@ -135,7 +135,7 @@ def test_clock_jump_restarts_ended_streams_without_waiting_for_absent_ones() -> 
     assert [r.stamp for r in collector.records if r.kind == "fire"] == [1000, 500]
 
 
-def test_after_a_jump_a_static_stream_that_ended_without_its_message_is_not_waited_for() -> None:
+def test_ended_static_stream_is_not_waited_for_after_a_clock_jump() -> None:
     runner, collector = live(node(Either, {"a": ["t/s/a"], "b": ["t/m/b"]}), static=frozenset({"t/m/b"}))
     runner.end("t/m/b", None, "its source has none")
     for stamp, incarnation in ((1000, 0), (500, 1)):

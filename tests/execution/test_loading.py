@@ -122,7 +122,7 @@ def test_a_library_that_a_thread_of_the_call_loads_is_seeded(modules: Path) -> N
     assert made(in_a_thread) == made(open3d_seed)
 
 
-def test_generators_of_gpus_are_seeded_when_a_call_initialises_them_and_in_each_call_after(modules: Path) -> None:
+def test_gpu_generators_are_seeded_on_initialisation_and_at_each_call(modules: Path) -> None:
     def seeds(k: int) -> float:
         torch: Any = importlib.import_module("torch")
         if not torch.cuda.is_initialized():

@@ -419,9 +419,7 @@ operators:
         ("limit=none", "threads must be a whole number from 1 to 256, not the text 'none'", 7, "graph.yaml:3:10"),
     ],
 )
-def test_fault_of_a_value_that_a_setting_gives_the_graph_is_shown_where_it_was_given(
-    setting: str, message: str, column: int, used: str
-) -> None:
+def test_error_of_a_setting_is_shown_in_the_setting(setting: str, message: str, column: int, used: str) -> None:
     (problem,) = problems(GIVEN, settings=[setting])
 
     assert (problem.file, problem.line, problem.column, problem.message) == ("--set", 1, column, message)

@@ -107,9 +107,7 @@ def test_a_graph_that_does_not_ask_for_its_folder_does_not_keep_it(tmp_path: Pat
     assert load_text("graph: g\noperators: {a: {use: 'needs_no_folder:Here'}}\n").sources_bundle.folder == ""
 
 
-def test_a_folder_that_this_process_was_started_with_is_named_among_those_looked_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_initial_folder_is_listed_among_the_searched_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
 
     search.add_folder(tmp_path)

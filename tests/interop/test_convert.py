@@ -278,7 +278,7 @@ def test_rgbd_folders_are_read_back_with_the_same_pixels_depths_and_poses(tmp_pa
     assert dataset.static_outputs()["depth_info"].fx == 50.0
 
 
-def test_images_and_poses_without_a_depth_image_are_counted_as_7scenes_leaves_them_out(tmp_path: Path) -> None:
+def test_images_and_poses_without_depth_are_counted_as_lost_by_7scenes(tmp_path: Path) -> None:
     made = frames()
     made["camera/depth"] = made["camera/depth"][::3]
 

@@ -99,7 +99,7 @@ def test_names_that_a_recording_gives_a_meaning_to_get_the_files_in_front(tmp_pa
         assert "machine" not in recording.metadata
 
 
-def test_of_the_files_of_a_split_bag_they_are_taken_once_and_those_that_differ_both(tmp_path: Path) -> None:
+def test_equal_attachments_of_a_split_bag_are_taken_once_and_different_ones_kept(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     foreign(folder / "bag_0.mcap", "/said", CALIBRATION, robot="r1", rosbag2="first")
     foreign(folder / "bag_1.mcap", "/said", CALIBRATION, ("calibration.yaml", "text/yaml", 9, 9, b""), robot="r2")

@@ -15,7 +15,7 @@ from dataflow.process.streams.inbox import Inbox
 LONG = AWAY_AFTER + 1
 
 
-def test_an_agent_without_a_run_is_offered_one_and_another_of_its_name_gets_nothing() -> None:
+def test_idle_agent_is_offered_the_run_and_its_namesake_is_not() -> None:
     claims = Claims("run")
     assert claims.answer("robot", b"1", "", None, 0.0) == "offer"
     assert claims.answer("robot", b"2", "", None, 0.1) == "another"

@@ -203,7 +203,7 @@ def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
 
 
 @pytest.mark.long
-def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_the_next_run(tmp_path: Path) -> None:
+def test_killed_supervisor_leaves_no_operators_and_the_machine_accepts_a_run(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
     agent = join("robot", endpoint, tmp_path / "files", "--timeout", "2")
     graph = tmp_path / "two.yaml"

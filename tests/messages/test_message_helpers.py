@@ -71,7 +71,7 @@ def test_labels_name_classes() -> None:
     assert found.replace(class_names=()).labels() == ("1", "0")
 
 
-def test_detections_without_masks_keep_the_digest_that_they_had_before_there_were_any() -> None:
+def test_detections_without_masks_keep_their_earlier_digest() -> None:
     found = m.Detections2D(
         stamp=1, frame="camera", width=12, height=4, class_names=("cup",), boxes=[[1, 1, 5, 3]], scores=[0.5],
         class_ids=[0],

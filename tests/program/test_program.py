@@ -72,7 +72,7 @@ def test_messages_of_every_type_come_back_bit_for_bit_from_cpp(relay: Relay) -> 
         assert outputs["count"] == Number(stamp=message.stamp, value=5.0, unit="messages")
 
 
-def test_a_large_message_comes_back(relay: Relay) -> None:
+def test_large_message_is_returned_by_the_program(relay: Relay) -> None:
     message = Image(stamp=1, frame="camera", data=np.arange(1200 * 1600 * 3, dtype=np.uint8).reshape(1200, 1600, 3))
     assert call(relay, 1, message=message)["back"].digest() == message.digest()
 

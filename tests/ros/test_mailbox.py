@@ -13,7 +13,7 @@ def sent(number: int) -> Attachment:
     return Attachment(number, 1000 * number, b"a" * 16)
 
 
-def test_it_gives_what_came_in_order_and_ends_when_it_is_closed() -> None:
+def test_mailbox_returns_arrivals_in_order_and_ends_when_closed() -> None:
     box = Mailbox()
     box.clock = 7
     box.sample(b"a", sent(1).encoded())

@@ -135,7 +135,7 @@ def test_types_without_a_counterpart_are_passed_on_as_they_are(endpoint: str, pe
         topics.Imu(topic="/gripper", router=endpoint).setup()
 
 
-def test_a_late_subscriber_gets_what_was_latched_and_both_publishers_count(endpoint: str, peer: Peer) -> None:
+def test_late_subscriber_receives_latched_messages_of_both_publishers(endpoint: str, peer: Peer) -> None:
     with Peer(endpoint, "second") as second:
         hash_ = JAZZY.hash_rihs01(TF)
         one, two = (each.publisher("/tf_static", TF, hash_, latched=1) for each in (peer, second))

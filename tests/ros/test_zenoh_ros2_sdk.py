@@ -102,7 +102,7 @@ def test_published_messages_arrive_at_the_ros2_subscriber(endpoint: dict[str, An
     images.close()
 
 
-def test_a_late_subscriber_of_the_other_side_gets_what_was_latched_here(endpoint: dict[str, Any]) -> None:
+def test_late_ros2_subscriber_receives_the_latched_message(endpoint: dict[str, Any]) -> None:
     from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
     sink = Ros2Sink(topic="/robot_description", type=STRING, router=endpoint["router"], durability="transient_local")

@@ -97,7 +97,7 @@ SMOOTH = f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, li
 FALLBACK = "{}: {{use: faulty_operators:Fallback, inputs: {{x: left/fast, other: smooth/mean}}{}}}"
 
 
-def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path) -> None:
+def test_crashed_process_is_replaced_while_the_rest_continues(path: Path) -> None:
     graph = robot(
         SMOOTH,
         FALLBACK.format("other", ""),
@@ -121,7 +121,7 @@ def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path)
 
 
 @pytest.mark.long
-def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(path: Path) -> None:
+def test_crashed_source_is_restarted_at_the_current_time(path: Path) -> None:
     ran = Ran(robot(SMOOTH, count=250), path, {"kind": "kill", "operator": "left", "at": "300ms"})
 
     assert ran.report.restarts == {"left": 1}
@@ -376,7 +376,7 @@ def test_clock_jump_back_starts_an_incarnation_and_resets_operators(path: Path) 
 
 
 @pytest.mark.long
-def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late(path: Path) -> None:
+def test_replay_after_a_clock_jump_back_drops_repeated_stamps_as_late(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 100}}",
         "both: {use: faulty_operators:Fallback, inputs: {x: left/fast, other: right/fast}}",
@@ -394,7 +394,7 @@ def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
 
 
 @pytest.mark.long
-def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
+def test_clock_jump_ahead_continues_the_incarnation(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
     ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "10s", "back": False, "at": "500ms"})

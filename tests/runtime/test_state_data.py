@@ -154,7 +154,7 @@ def round_trip(state: State) -> State:
     return restored
 
 
-def test_every_kind_of_field_comes_back_as_it_was() -> None:
+def test_state_fields_of_every_kind_are_restored() -> None:
     state = filled()
 
     back = round_trip(state)
@@ -176,7 +176,7 @@ def plain_bytes(state: State) -> bytes:
 
 @settings(max_examples=60)
 @given(st.lists(st.integers(0, 100), min_size=1, max_size=12), st.integers(1, 5), st.integers(0, 12))
-def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: int, cut: int) -> None:
+def test_operator_restored_at_any_call_continues_identically(stamps: list[int], length: int, cut: int) -> None:
     whole, begun, later = (Averager(size=length) for _ in range(3))
     expected = [whole.process(number(s)).digest() for s in stamps]
     first = [begun.process(number(s)).digest() for s in stamps[:cut]]
@@ -208,7 +208,7 @@ class Counting(Counts):
     empty: bool = False
 
 
-def test_a_count_that_was_begun_with_a_truth_value_comes_back() -> None:
+def test_counter_started_with_a_bool_is_restored() -> None:
     counting = Counting()
     counting.counts.update({"clouds without": True})
     packed = pack_state(plain(counting))
@@ -342,7 +342,7 @@ class Shelf(Generic[V]):
     by_id: dict[int, Kept[V]] = field(default_factory=dict)
 
 
-def test_a_generic_dataclass_comes_back_with_the_types_that_it_is_used_with() -> None:
+def test_generic_dataclass_is_restored_with_its_type_arguments() -> None:
     shelf = Shelf({1: Kept("there", Track(1, np.zeros(3))), 2: Kept("here")})
 
     back = typed(Shelf[Track], unpack_state(pack_state(plain(shelf))))

@@ -47,7 +47,7 @@ def same(a: Any, b: Any) -> bool:
 
 @settings(max_examples=150)
 @given(states)
-def test_a_state_comes_back_bit_by_bit(state: dict[str, Any]) -> None:
+def test_state_is_restored_bit_for_bit(state: dict[str, Any]) -> None:
     assert same(unpack_state(pack_state(state)), state)
 
 
@@ -57,7 +57,7 @@ def test_equal_states_have_equal_bytes_whatever_the_order_of_their_keys(state: d
     assert pack_state(dict(reversed(state.items()))) == pack_state(state)
 
 
-def test_an_array_of_any_layout_comes_back_and_can_be_written_to() -> None:
+def test_array_of_any_layout_is_restored_and_writable() -> None:
     state = {"columns": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "part": np.arange(10)[::3]}
 
     restored = unpack_state(pack_state(state))

@@ -54,7 +54,7 @@ def test_one_operator_is_verified_alone_with_its_inputs_taken_from_the_recording
     assert report.stood_in == ("mix",)
 
 
-def test_an_operator_and_what_follows_from_it(recorded: Path) -> None:
+def test_verify_first_covers_the_operator_and_its_downstream(recorded: Path) -> None:
     assert set(verdicts(verify(recorded, first="merge"))) == {"merge", "sum"}
 
 

@@ -82,7 +82,7 @@ def test_tasks_wait_on_simulated_time_and_are_woken() -> None:
     assert seen == [("slept", 3600), ("woken", 3600)]
 
 
-def test_a_killed_process_does_nothing_more_and_a_frozen_one_goes_on_where_it_was() -> None:
+def test_killed_process_stops_and_a_frozen_one_resumes() -> None:
     world = World(1)
     seen: Counter[str] = Counter()
 
@@ -158,7 +158,7 @@ def _functions(module: ModuleType) -> Iterator[FunctionType]:
 # Runs
 
 
-def test_ticks_that_came_due_during_a_pause_are_given_the_time_of_those_of_a_freeze() -> None:
+def test_time_limit_allows_for_ticks_due_during_a_pause() -> None:
     ticks = replace(PLAIN, graph=TICKING, live=True, work=0.05)
     frozen, paused = (
         replace(ticks, happenings=(Happening(0.1, kind, "left", {"span": 6.0}),)) for kind in ("freeze", "pause")
@@ -179,7 +179,7 @@ def test_a_seed_gives_one_course(memory: Path) -> None:
     assert courses[0] == courses[1]
 
 
-def test_a_killed_process_of_a_live_run_comes_back_and_the_recording_is_whole(memory: Path) -> None:
+def test_killed_process_of_a_live_run_restarts_and_the_recording_is_whole(memory: Path) -> None:
     policy = "restart: {max: 5, backoff: 10ms}"
     kills = (Happening(0.03, "kill", "relay"), Happening(0.06, "kill", "left"))
     scenario = replace(PLAIN, live=True, policy=policy, count=12, period=20_000_000, happenings=kills)
@@ -283,9 +283,7 @@ def test_recording_lacking_inputs_of_actuators_is_completed_not_replayed(memory:
         ("sum was at stamp 3 after 1 firings, sources had given up to 9", 0.97, False),
     ],
 )
-def test_only_a_recorder_that_writes_all_the_time_may_leave_a_stopped_run_undrained(
-    owed: str, busy: float, outrun: bool
-) -> None:
+def test_only_a_constantly_writing_recorder_excuses_incomplete_draining(owed: str, busy: float, outrun: bool) -> None:
     failure = RunFailed(f"interrupted, and not everything was drained within 20 s: {owed}", interrupted=True)
 
     assert is_outrun(Outcome(failure=failure, disk_busy=busy)) is outrun
@@ -385,7 +383,7 @@ def test_recording_mutants_are_detected(name: str, seed: int, memory: Path) -> N
         check(scenario_of(seed), memory, replay=False)
 
 
-def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
+def test_pipe_mutant_that_ignores_link_losses_is_detected() -> None:
     travel(journey_of(3))
 
     with MUTANTS["link"].planted(), pytest.raises(Violation, match=r"out of order|was changed|did not come"):

@@ -82,7 +82,7 @@ def test_queue_of_irreplaceable_messages_is_bounded(stopped: tuple[QueuedChannel
     assert channel.queued < 1.2 * (1 << 20)
 
 
-def test_news_follows_what_was_queued_after_older_news() -> None:
+def test_replacing_message_keeps_the_latest_value_only() -> None:
     channel = QueuedChannel()
     process = Channel(channel.theirs)
     channel.send("covered", {"frontier": 1}, replaces=True)

@@ -256,7 +256,7 @@ def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> 
     assert killed(play.commands) == []
 
 
-def test_a_process_that_is_still_starting_at_ctrl_c_is_killed_soon_and_that_is_no_failure() -> None:
+def test_process_still_starting_at_ctrl_c_is_killed_without_failure() -> None:
     play = Play(record="run.mcap")
     play.deaf.add("sum")
     play.tell(Begin(), Said("sum", "joined", {}))
@@ -460,7 +460,7 @@ def test_event_time_goes_by_the_rate_from_the_first_stamp() -> None:
     assert event["stamp"] == pytest.approx(8_000_000_000, abs=1e3)
 
 
-def test_a_report_has_what_processes_handed_in() -> None:
+def test_report_collects_the_figures_of_processes() -> None:
     play = Play(record="run.mcap").starts()
     play.tell(play.progress("left", {"left": 70}, drops={"sum": [["x", "full", 2]]}))
     play.now += 2.5

@@ -46,7 +46,7 @@ def runs(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def test_processes_of_an_early_nursery_find_modules_variables_and_libraries_that_came_after_it(
+def test_early_nursery_processes_see_later_modules_and_variables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_sum.py").write_text(OWN)

@@ -100,7 +100,7 @@ def test_messages_sent_on_a_link_arrive() -> None:
 
 
 @pytest.mark.parametrize(("live", "kept"), [(False, 20_000), (True, 5_000)])
-def test_only_operators_of_a_live_run_may_miss_what_they_do_not_take(live: bool, kept: int) -> None:
+def test_only_links_to_operators_of_a_live_run_drop(live: bool, kept: int) -> None:
     with opened(plan(record=Path("run.mcap"), live=live)) as handed:
         for _, link in handed["smooth"].outgoing:
             for _ in range(20_000):

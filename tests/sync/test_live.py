@@ -32,7 +32,7 @@ def stamps(firings: list[Firing]) -> list[int]:
     return [f.stamp for f in firings]
 
 
-def test_a_trigger_at_or_before_the_last_decided_stamp_is_late_and_one_above_is_not() -> None:
+def test_trigger_is_late_up_to_the_last_decided_stamp() -> None:
     aligner = Aligner(AlignSpec((A, B), mode="merge"))
     push(aligner, "b", 60)
     aligner.force("a", 100)
@@ -227,7 +227,7 @@ def test_forcing_the_awaited_inputs_decides_the_stamp(scenario: Scenario, seed: 
         assert after is None or after.stamp > waiting.stamp or (unforced and set(after.needs) <= static_missing)
 
 
-def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
+def test_recorded_aligner_buffers_only_messages_of_later_records() -> None:
     spec = AlignSpec((A,), (SampledSpec("x", ("x",), required=False, max_age=1),))
     says: dict[str, list[Step]] = {
         "a": [("push", "a", e) for e in entries("a", *range(0, 900, 10))],

@@ -97,7 +97,7 @@ def test_a_late_joiner_gets_the_static_streams_it_asks_for(
     assert bus.query_static("robot2") == {}
 
 
-def test_a_process_that_comes_back_on_its_endpoint_is_connected_again(
+def test_restarted_process_on_its_endpoint_is_reconnected(
     peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
 ) -> None:
     bus = open_bus(connect=(endpoint,))

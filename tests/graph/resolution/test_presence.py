@@ -55,7 +55,7 @@ def test_everything_is_there_where_every_input_is_given() -> None:
     assert taken(graph, "part/mapper", "cloud") == ("part/builder/cloud",)
 
 
-def test_an_operator_without_an_input_that_it_needs_is_left_out_with_all_that_needs_it() -> None:
+def test_operator_without_required_input_is_left_out_with_its_dependents() -> None:
     graph = outer("")
     assert "part/builder" not in graph.nodes
     assert "part/mapper" not in graph.nodes

@@ -149,7 +149,7 @@ def test_a_view_of_a_lost_odometry_does_not_decide() -> None:
     assert mount.process(cloud(room(28, 0), 1)) is not None
 
 
-def test_the_ground_that_a_view_before_showed_counts_where_the_one_that_decides_shows_none(
+def test_ground_of_an_earlier_view_counts_if_the_last_shows_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     up, sure = np.array([0.0, -1.0, 0.0]), np.eye(3) * np.radians(0.5) ** 2

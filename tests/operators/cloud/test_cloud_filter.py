@@ -59,7 +59,7 @@ def test_voxel_holds_the_means_of_points_colors_and_intensities() -> None:
     assert out.rings is None
 
 
-def test_chosen_points_of_an_organised_cloud_keep_their_precise_coordinates_and_no_rows() -> None:
+def test_filtered_organised_cloud_keeps_precise_coordinates_and_loses_rows() -> None:
     points = np.array([[1.0, 0, 0], [9, 0, 0], [2, 0, 0], [3, 0, 0]])
     out, _ = filtered(cloud(points, precise=points + 1e6, columns=2), max_range=5.0)
     assert (out.columns, out.precise.tolist()) == (None, (points[[0, 2, 3]] + 1e6).tolist())

@@ -105,7 +105,7 @@ def test_long_room_is_registered_along_its_length() -> None:
     assert explained_at_the_truth(scan(A, 1, niches, long), scan(B, 2, niches, long), A, B).reason == ""
 
 
-def test_surfaces_that_agree_well_make_up_for_a_little_fitness_and_others_are_not_believed() -> None:
+def test_agreeing_surfaces_compensate_low_fitness() -> None:
     A, B = at(0.2, 0.1, 0.0), at(0.9, -0.2, 0.6)
     source, target = (Prepared.of_cloud(scan(T, k, BOXES).astype(np.float32), 0.1) for k, T in enumerate((B, A)))
     T = invert(A) @ B

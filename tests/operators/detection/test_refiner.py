@@ -365,9 +365,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(refined: Refined, tmp_p
 
 
 @pytest.mark.long
-def test_a_refiner_is_not_trained_for_other_classes_nor_resumed_for_another_detector(
-    refined: Refined, tmp_path: Path
-) -> None:
+def test_refiner_refuses_other_classes_and_another_detector(refined: Refined, tmp_path: Path) -> None:
     plain, _, data = refined
     other = untrained(tmp_path, ("crate", "ball", "lamp"))
     with pytest.raises(TrainingFileError, match=r"has crate, ball, lamp; the data have crate, ball"):

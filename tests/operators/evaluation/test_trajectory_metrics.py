@@ -148,7 +148,7 @@ def test_too_few_poses_or_a_path_without_motion_have_no_aligned_error(count: int
 
 
 @pytest.mark.parametrize("lost", ["unmatched_estimates", "truths_not_finite", "estimates_not_finite"])
-def test_poses_without_a_finite_truth_or_not_finite_are_counted_and_the_others_score(lost: str) -> None:
+def test_non_finite_poses_are_counted_and_the_others_scored(lost: str) -> None:
     path, nowhere = circle(), {"position": [np.nan, 0, 0]}
     estimates, truths = [estimate(T, k) for k, T in enumerate(path)], [[truth(T, k)] for k, T in enumerate(path)]
     for k in (10, 11):

@@ -77,7 +77,7 @@ def test_a_message_that_cannot_be_used_is_counted(message: Message, reason: str)
     np.testing.assert_array_equal(after.covariance, before.covariance)
 
 
-def test_detections_and_landmarks_that_cannot_be_used_are_counted_and_the_others_serve() -> None:
+def test_unusable_detections_and_landmarks_are_counted_and_others_used() -> None:
     operator = begun(ranges={"sigma": 0.1})
     stamp = 19 * 10**8
     scan = RadarScan(stamp=stamp, frame="radar", ranges=[5.0] * 3, azimuths=[0.0, 0.1, NAN], velocities=[0.0, NAN, 0.0])

@@ -51,7 +51,7 @@ def off(drive: Drive, played: Played) -> list[float]:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
-def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_are_named(seed: int) -> None:
+def test_symmetric_hall_is_ambiguous_and_both_places_are_named(seed: int) -> None:
     drive = HallDrive(5.0, seed=seed)
     played, operator = localized(drive, {"scan": drive.scans()})
     assert not played["pose"]

@@ -239,7 +239,7 @@ def test_an_object_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: 
     assert digests[0] == digests[1]
 
 
-def test_odometry_and_rates_that_are_not_finite_or_late_are_counted_and_the_robot_is_followed() -> None:
+def test_non_finite_or_late_odometry_is_counted_and_localization_continues() -> None:
     drive = Drive(4.0)
     odometry: list[Any] = drive.odometry()
     for k in (30, 31, 50):

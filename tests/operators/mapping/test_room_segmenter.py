@@ -150,7 +150,7 @@ def test_rooms_keep_their_ids_while_the_map_grows() -> None:
     assert {at(after, 2.5, 4), at(after, 5, 1.3)} == {2, 3}
 
 
-def test_rooms_that_prove_to_be_one_keep_the_id_of_the_larger_and_the_other_is_given_no_more() -> None:
+def test_merged_rooms_keep_the_id_of_the_larger_and_retire_the_other() -> None:
     one = FloorPlan(9.5, 6.5).rooms((0.5, 0.7, 9.0, 6.0))
     before, after, again = segmented([flat().at(0), one.at(3), flat().at(6)])
     assert after.ids.tolist() == [at(before, 7, 4)]
@@ -190,7 +190,7 @@ def test_restored_operator_resumes_alike() -> None:
 
 
 @pytest.mark.parametrize("clear", [0.7, 0.83, 1.0])
-def test_the_width_of_a_door_is_that_between_its_jambs_wherever_they_lie_in_their_cells(clear: float) -> None:
+def test_door_width_is_unbiased_by_the_grid(clear: float) -> None:
     """A cell is taken where a jamb lies in it: in the mean over places the width is neither too small nor too large."""
     widths = []
     for start in np.arange(1.5, 1.5 + SIDE, SIDE / 10):

@@ -24,7 +24,7 @@ def test_new_images_pass_as_they_are() -> None:
     assert [m.digest() for m in played["checked"]] == [m.digest() for m in given]
 
 
-def test_images_that_repeat_the_last_one_or_are_black_are_held_back_until_they_change() -> None:
+def test_repeated_or_black_images_are_held_back() -> None:
     played = play(ImageWatch(), {"image": images(50, 50, 50, 60, 0, 70)})
     assert [m.stamp for m in played["checked"]] == [0, 3, 5]
     said = [status.messages[0] for status in played["status"]]

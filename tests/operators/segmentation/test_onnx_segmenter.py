@@ -90,7 +90,7 @@ def test_classes_and_confidence_are_those_of_the_network_called_directly(tmp_pat
     np.testing.assert_allclose(found.confidence, softmax(scores).max(axis=0), atol=1e-4)
 
 
-def test_scores_at_a_fourth_of_the_resolution_are_enlarged_before_the_best_class_is_taken(tmp_path: Path) -> None:
+def test_low_resolution_scores_are_interpolated_before_argmax(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS, stride=4, size=(48, 64), metadata=NAMED)
     found = segmented(model=model, mean=(0, 0, 0), std=(1, 1, 1))
     tensor = (image().data / 255).transpose(2, 0, 1)[None].astype(np.float32)
@@ -302,7 +302,7 @@ def test_another_provider_is_refused(provider: str) -> None:
 
 
 @pytest.mark.long
-def test_an_exported_network_of_torchvision_gives_the_map_of_the_operator_for_those(tmp_path: Path) -> None:
+def test_exported_torchvision_network_equals_the_torchvision_operator(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     models = pytest.importorskip("torchvision.models")
     from operators.segmentation import TorchvisionSegmenter

@@ -186,7 +186,7 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
 
 
 @pytest.mark.long
-def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
+def test_alternative_headings_expire_in_motion_only() -> None:
     rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
     samples = [
         Sample(ns(0.05 * k), 4e-3 * rng.standard_normal(3), still + 0.05 * rng.standard_normal(3), NOISE)

@@ -87,7 +87,7 @@ def test_a_place_that_repeats_is_frozen_where_the_body_has_left_it(
     assert frozen(state_of(speed, sigma), seconds) == expected
 
 
-def test_a_place_that_contradicted_the_estimate_from_the_first_shows_nothing_by_repeating() -> None:
+def test_repeated_place_that_never_fitted_is_no_evidence() -> None:
     first = repeat_of(None, measured(0.0, Position(PLACE, ZERO)), state_of(0.8), fits=False)
     again = repeat_of(first, measured(0.4, Position(PLACE, ZERO)), state_of(0.8), fits=False)
     assert (again.speed, again.frozen) == (0.0, False)

@@ -63,7 +63,7 @@ def nees(filter: ErrorStateFilter, seconds: float = 10.0) -> float:
 
 
 @pytest.mark.long
-def test_a_drift_taken_for_noise_makes_the_covariance_too_small_and_a_state_does_not() -> None:
+def test_drift_state_keeps_the_covariance_consistent() -> None:
     drifting = SensorErrors(drifts=(("fix", (DRIFT,) * 3, 1000.0),))
     white = np.mean([nees(driven(seed, SensorErrors())) for seed in range(6)])
     held = np.mean([nees(driven(seed, drifting)) for seed in range(6)])

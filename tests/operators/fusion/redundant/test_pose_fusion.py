@@ -67,7 +67,7 @@ def test_poses_and_an_orientation_near_half_a_turn_are_averaged_on_the_manifold(
     assert operator.summary()["ignored, position or orientation unknown"] == 3
 
 
-def test_two_poses_that_contradict_each_other_are_a_diagnostic_and_the_covariance_holds_both() -> None:
+def test_contradicting_poses_are_reported_and_inflate_the_covariance() -> None:
     rng = [np.random.default_rng(k) for k in range(2)]
     played, operator = body({"camera": poses(5, rng[0]), "lidar": poses(5, rng[1], off=0.5)})
     assert operator.summary()["two sensors contradicted each other"] == 5

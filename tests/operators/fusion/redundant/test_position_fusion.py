@@ -117,7 +117,7 @@ def process(operator: PositionFusion, message: LandmarkSightings) -> None:
     operator.process({"ns/lidar/things": message}, Context(message.stamp), {"ns/robot/extrinsics": mounts()})
 
 
-def test_sightings_that_cannot_be_used_are_counted_with_the_reason_and_the_others_serve() -> None:
+def test_unusable_sightings_are_counted_by_reason_and_others_used() -> None:
     operator = PositionFusion()
     operator.setup()
     good = lidar(1, np.random.default_rng(0))[0]

@@ -137,7 +137,7 @@ def test_a_sweep_is_deskewed_by_the_mean_velocity_since_the_last_pose_but_one() 
     np.testing.assert_allclose(first.sweep_velocity(here, 3 * SECOND // 2)[:3], [0.4, 0.0, 0.0], atol=1e-12)
 
 
-def test_the_spread_of_a_prediction_grows_with_time_and_is_that_of_any_speed_at_first() -> None:
+def test_prediction_spread_grows_with_time_and_starts_at_any_speed() -> None:
     known = LidarMotion(0, np.eye(4), np.zeros(6), np.zeros((6, 6)), fresh=False)
     np.testing.assert_allclose(np.sqrt(np.diag(known.spread(SECOND // 5, 10.0, 5.0, 30.0))), [0.4] * 3 + [0.2] * 3)
     fresh = LidarMotion(0, np.eye(4), np.zeros(6), np.zeros((6, 6)))

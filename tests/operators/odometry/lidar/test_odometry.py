@@ -158,7 +158,7 @@ def test_position_along_a_bare_corridor_is_unconstrained_and_its_covariance_grow
     assert np.abs(off[1:3]).max() < 0.03
 
 
-def test_an_epoch_of_the_map_begins_where_the_pose_moved_or_became_much_less_certain() -> None:
+def test_map_epoch_begins_when_the_pose_moved_or_lost_certainty() -> None:
     """What is seen first then is as unsure as the pose, what was seen before stays as it was."""
     operator = LidarOdometry()
     operator.setup()

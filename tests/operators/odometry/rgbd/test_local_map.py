@@ -65,7 +65,7 @@ def test_recomputed_planes_are_identical() -> None:
     assert surface.bordered.tobytes() == bordered.tobytes()
 
 
-def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifted_far() -> None:
+def test_keyframes_with_large_possible_drift_are_not_used() -> None:
     """It comes round to the first of them, whose place by the newest is as unsure as the way between them was long."""
     known = LocalMap(20)
     for number in range(4):

@@ -487,7 +487,7 @@ def test_a_new_map_begins_elsewhere_and_is_forgotten_when_the_old_one_is_seen_ag
     assert {k.segment for k in odometry.state.map.keyframes} == {0}
 
 
-def test_a_camera_in_a_new_map_counts_as_tracking_after_a_while_though_its_place_is_unknown() -> None:
+def test_camera_in_a_new_map_is_tracking_after_the_give_up_time() -> None:
     _, poses = sequence(25, 3.0)
     odometry = in_the_dark([AROUND @ T for T in poses[:2]], RgbdOdometryConfig(give_up_s=0.2))
     T = AROUND @ poses[2]
@@ -496,7 +496,7 @@ def test_a_camera_in_a_new_map_counts_as_tracking_after_a_while_though_its_place
     assert result.reason.endswith("; a new map, its place in the old one unknown")
 
 
-def test_a_new_map_goes_where_it_belongs_when_a_view_of_it_is_recognised_in_the_old_one(
+def test_new_map_is_aligned_when_a_view_is_recognised_in_the_old_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """For three frames nothing is recognised, so a new map begins where the camera is believed to be, a metre off."""

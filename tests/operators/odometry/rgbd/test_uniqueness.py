@@ -114,7 +114,7 @@ def test_a_corridor_whose_pattern_does_not_repeat_is_evidence() -> None:
     assert taken_for(groove, 6.0, 0.1, 0.1)
 
 
-def test_a_plane_of_which_too_little_is_seen_for_its_pattern_to_repeat_is_no_evidence() -> None:
+def test_narrow_strip_of_a_plane_is_no_evidence() -> None:
     def strip(X: Array, Y: Array) -> Array:
         return np.where(np.abs(Y) < 0.2, 2.0, 1e3)  # which is no return
 

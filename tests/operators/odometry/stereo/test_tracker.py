@@ -281,7 +281,7 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
         assert np.linalg.norm((k.T_world_camera - truth[k.stamp])[:3, 3]) < 0.1
 
 
-def test_a_view_is_found_among_pairs_that_were_kept_and_believed_where_they_show_the_same() -> None:
+def test_view_is_relocalized_among_kept_pairs_that_agree() -> None:
     pairs, poses = sequence(25)
 
     def kept(k: int, T: Matrix, segment: int = 0) -> StereoKeyframe:

@@ -37,7 +37,7 @@ def test_a_body_fills_the_cells_that_it_is_seen_in() -> None:
     assert abs((columns.max() + columns.min() + 1) / 2 - SIDE / 2) <= 1
 
 
-def test_a_hand_stretched_to_the_right_is_to_the_right_and_nearer_where_it_is_nearer() -> None:
+def test_hand_stretched_to_the_right_appears_right_and_nearer() -> None:
     hand = wall(2.7, (-0.6, -0.4), (1.0, 1.1))  # y points left
     body, near, _ = made(np.concatenate([wall(3.0, (-0.2, 0.2), (0.0, 1.7)), hand]))
     assert body[:, SIDE // 2 + 12 :].any()

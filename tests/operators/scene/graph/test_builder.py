@@ -244,7 +244,7 @@ def test_classes_without_an_entry_in_the_label_space_are_related_and_named_once(
     assert "the label space coco has no entry for 'zorb', 'dax'" in record.getMessage()
 
 
-def test_with_the_classes_of_coco_things_are_in_a_refrigerator_and_persons_sit_on_couches() -> None:
+def test_coco_classes_support_in_refrigerator_and_sitting_on_couch() -> None:
     refrigerator: Thing = (1, "refrigerator", (0, 0, 0.9), (0.6, 0.6, 1.8))
     bottle: Thing = (2, "bottle", (0, 0, 1.0), (0.08, 0.08, 0.3))
     couch: Thing = (3, "couch", (3, 0.1, 0.4), (0.9, 1.8, 0.8))

@@ -72,7 +72,7 @@ def test_cup_in_front_of_a_boxed_object_is_excluded_from_it() -> None:
     assert set(seen.points[found.points, 2]) == {3.0}
 
 
-def test_columns_of_pixels_hold_all_points_between_two_places_and_none_that_is_a_pixel_away() -> None:
+def test_pixel_columns_return_the_points_between_two_places() -> None:
     rng = np.random.default_rng(3)
     u, v = rng.uniform(0, 640, 4000), rng.uniform(0, 480, 4000)
     inside = rng.random(4000) < 0.8

@@ -36,7 +36,7 @@ def entry(id: int, y: float, class_id: int = 0) -> MapObject:
         (1, 0.4, 20, True), (2, 0.3, 0, False), (2, 0.45, 0, True), (2, 0.45, 4, False),
     ],
 )  # fmt: skip
-def test_entries_that_share_their_place_are_one_unless_views_show_them_beside_each_other(
+def test_overlapping_entries_are_merged_unless_seen_side_by_side(
     classes: int, shared: float, beside: int, one: bool
 ) -> None:
     a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared), classes - 1)

@@ -144,7 +144,7 @@ def test_box_is_completed_away_from_the_viewer_by_the_usual_size() -> None:
     np.testing.assert_allclose(size, seen[1])
 
 
-def test_boxes_of_the_image_keep_neighbours_apart_and_a_restored_map_goes_on_the_same() -> None:
+def test_image_boxes_separate_neighbours_also_after_restoring() -> None:
     """Two crates that nearly touch, seen from the front: voxels alone cannot tell where one ends."""
     pair: list[Solid] = [((2.5, y, 0.15), (0.3, 0.2, 0.3), 0.0, 0) for y in (0.0, 0.22)]
     given = views([pair] * 10, images=True)

@@ -90,7 +90,7 @@ def test_keyframes_move_the_poses_at_their_times_and_those_behind_them_as_the_la
         np.testing.assert_allclose(trajectory.poses[k - 2], by @ motion(float(k), 0, 0), atol=1e-9)
 
 
-def test_keyframes_that_agree_move_nothing_and_those_of_other_times_are_passed_over() -> None:
+def test_agreeing_keyframes_correct_nothing_and_unmatched_ones_are_ignored() -> None:
     trajectory = drifted()
     known = keyframes([-STEP, 0, 9 * STEP, 20 * STEP], [motion(x, 0, 0) for x in (-7.0, 0.0, 9.0, 50.0)])
 
