@@ -12,7 +12,6 @@ from typing import Any
 
 import psutil
 import pytest
-from background_run import Background
 from prometheus_text import prometheus
 from span_collector import collector
 
