@@ -185,9 +185,7 @@ def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
     assert "as fast as it goes" in told
 
 
-def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(
-    dataflow, running: AttachedRun, tmp_path: Path
-) -> None:
+def test_view_follows_the_graph_to_its_end_and_saves_it(dataflow, running: AttachedRun, tmp_path: Path) -> None:
     """The last test of the file: it ends the graph."""
     saved = tmp_path / "live.rrd"
     threading.Timer(1.0, running.supervisor.stop).start()

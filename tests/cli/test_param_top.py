@@ -33,7 +33,7 @@ operators:
 """
 
 
-class Tunable(Background):
+class Tunable(AttachedRun):
     """A live run in a process each, which is recorded."""
 
     def __init__(self, folder: Path) -> None:
