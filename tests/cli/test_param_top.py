@@ -12,6 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
+from attached_run import AttachedRun
 from prometheus_text import prometheus
 from span_collector import collector
 
