@@ -105,7 +105,7 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     ids=["flight recorder", "no flight recorder", "live"],
 )
 def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, offers: tuple[Offer, ...], meant: list[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], offers: tuple[Offer, ...], meant: list[str]
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []
@@ -133,6 +133,8 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
 
     assert done == meant
     assert after == before
+    told = " ".join(capsys.readouterr().err.split())
+    assert ("k: save the history" in told) is (KEEPING in offers)
 
 
 def test_a_job_in_the_background_reads_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
