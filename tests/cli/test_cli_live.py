@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from background_run import Background
+from attached_run import AttachedRun
 
 from dataflow.cli.commands.following.live import _Rate
 from dataflow.graph import load_graph
@@ -19,10 +19,10 @@ from dataflow.supervision.plan import RunPlan
 
 
 @pytest.fixture(scope="module")
-def running(small: Path) -> Iterator[Background]:
+def running(small: Path) -> Iterator[AttachedRun]:
     """A graph that runs as long as the tests of this file need."""
     graph = load_graph(small, settings=["count=1000000", "sleep=0.02"])
-    background = Background(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
+    background = AttachedRun(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
     yield background
     if background.thread.is_alive():
         background.end()
@@ -142,7 +142,7 @@ def test_rates_over_a_window_ignore_earlier_messages() -> None:
     assert rate.row("s")["hz_clock"] is None
 
 
-def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: Background) -> None:
+def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: AttachedRun) -> None:
     told = dataflow("echo", "--graph", "kitchen", code=2).stderr
     assert "no graph 'kitchen' runs on this machine (running: small)" in told
     assert "0 or more" in dataflow("hz", "--wait", "-1", code=2).stderr
@@ -185,7 +185,7 @@ def test_run_is_paused_stepped_and_resumed(dataflow) -> None:
     assert "as fast as it goes" in told
 
 
-def test_view_follows_the_graph_to_its_end_and_saves_it(dataflow, running: Background, tmp_path: Path) -> None:
+def test_view_follows_the_graph_to_its_end_and_saves_it(dataflow, running: AttachedRun, tmp_path: Path) -> None:
     """The last test of the file: it ends the graph."""
     saved = tmp_path / "live.rrd"
     threading.Timer(1.0, running.supervisor.stop).start()

@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from background_run import Background
+from attached_run import AttachedRun
 from prometheus_text import prometheus
 from span_collector import collector
 
@@ -34,7 +34,7 @@ operators:
 """
 
 
-class Tunable(Background):
+class Tunable(AttachedRun):
     """A live run in a process each, which is recorded."""
 
     def __init__(self, folder: Path) -> None:

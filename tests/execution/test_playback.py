@@ -105,7 +105,7 @@ def test_keys_match_the_help_text(typed: bytes, meant: list[str]) -> None:
     ids=["flight recorder", "no flight recorder", "live"],
 )
 def test_terminal_keys_control_playback_and_restore_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, offers: tuple[Offer, ...], meant: list[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], offers: tuple[Offer, ...], meant: list[str]
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []
@@ -133,6 +133,8 @@ def test_terminal_keys_control_playback_and_restore_the_terminal(
 
     assert done == meant
     assert after == before
+    told = " ".join(capsys.readouterr().err.split())
+    assert ("k: save the history" in told) is (KEEPING in offers)
 
 
 def test_a_job_in_the_background_reads_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ PLAYING = Offer(
     "space: pause and go on · → or n: one step · + and -: twice and half as fast",
     frozenset({"toggle", "step", "faster", "slower"}),
 )
-KEEPING = Offer("k: keep what was", frozenset({"keep"}))
+KEEPING = Offer("k: save the history", frozenset({"keep"}))
 ENDING = Offer("q: end", frozenset({"quit"}))
 ACTIONS = ("pause", "resume", "step", "speed", "status")
 
