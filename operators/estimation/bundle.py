@@ -8,8 +8,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+
+def in_cameras(poses: Array, points: Array, frames: Indices, seen: Indices) -> tuple[Array, Array]:
+    """Returns points (S, 3) in the cameras that see them, and R_camera_world (S, 3, 3), of poses T_world_camera."""
+    inverse = invert(poses)
+    R = inverse[frames, :3, :3]
+    return np.einsum("sij,sj->si", R, points[seen]) + inverse[frames, :3, 3], R
 
 
 def pose_jacobian(J: Array, points: Array) -> Array:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import invert
-from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, in_cameras, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Pixels, Points
+from operators.geometry.pinhole import Pixels, Points, project_clamped, projection_jacobian
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
@@ -75,12 +74,8 @@ def adjust(
 
 
 def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, sigma: float) -> _Errors:
-    inverse = np.array([invert(T) for T in poses])
-    R = inverse[seen.frames, :3, :3]
-    p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
-    z = np.maximum(p[:, 2], NEAR)
-    u, v = K[0, 0] * p[:, 0] / z + K[0, 2], K[1, 1] * p[:, 1] / z + K[1, 2]
-    r = (np.column_stack([u, v]) - seen.pixels) / sigma
+    p, R = in_cameras(poses, points, seen.frames, seen.points)
+    r = (project_clamped(p, K, NEAR) - seen.pixels) / sigma
     # What lies behind counts as a constant, so that no step gains by putting a point there.
     chi = np.where(p[:, 2] > NEAR, (r * r).sum(axis=1), 1e6)
     return _Errors(r, p, R, float(np.log1p(chi / CAUCHY**2).sum()))
@@ -93,10 +88,7 @@ def _step(
     """Returns poses and points after a damped step of Gauss and Newton."""
     free = len(poses) - fixed
     p, R, r = at.points, at.rotations, at.residuals
-    z = np.maximum(p[:, 2], NEAR)
-    D = np.zeros((len(p), 2, 3))
-    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z / sigma, -K[0, 0] * p[:, 0] / z**2 / sigma
-    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z / sigma, -K[1, 1] * p[:, 1] / z**2 / sigma
+    D = projection_jacobian(p, K, NEAR) / sigma
     weight = np.where(p[:, 2] > NEAR, cauchy((r * r).sum(axis=1) / CAUCHY**2), 0.0)
     system = PosesAndPoints(
         seen.frames - fixed, seen.points, (free, len(points)), pose_jacobian(D, p), D @ R, r, weight[:, None]
