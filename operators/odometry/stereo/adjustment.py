@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, in_cameras, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Points
+from operators.geometry.pinhole import Points, project_clamped, projection_jacobian
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
@@ -49,10 +49,8 @@ class StereoRig:
 
     def project(self, points: Points) -> NDArray[np.float64]:
         """Returns (N, 3) left column, row, right column of points (N, 3) in the left camera; z at least NEAR."""
-        z = np.maximum(points[:, 2], NEAR)
-        u = self.K[0, 0] * points[:, 0] / z + self.K[0, 2]
-        v = self.K[1, 1] * points[:, 1] / z + self.K[1, 2]
-        return np.column_stack([u, v, u - self.K[0, 0] * self.baseline / z])
+        left = project_clamped(points, self.K, NEAR)
+        return np.column_stack([left, left[:, 0] - self.K[0, 0] * self.baseline / np.maximum(points[:, 2], NEAR)])
 
     def triangulate(self, sightings: NDArray[np.float64]) -> Points:
         """Returns points (N, 3) in the left camera of sightings (N, 3) with a positive disparity."""
@@ -63,14 +61,8 @@ class StereoRig:
 
     def jacobian(self, points: Points) -> NDArray[np.float64]:
         """Returns d sighting / d point (N, 3, 3)."""
-        x, y = points[:, 0], points[:, 1]
-        z = np.maximum(points[:, 2], NEAR)
-        fx, fy = self.K[0, 0], self.K[1, 1]
-        J = np.zeros((len(points), 3, 3))
-        J[:, 0, 0] = J[:, 2, 0] = fx / z
-        J[:, 0, 2] = -fx * x / z**2
-        J[:, 2, 2] = -fx * (x - self.baseline) / z**2
-        J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * y / z**2
+        J = projection_jacobian(points, self.K, NEAR).take([0, 1, 0], axis=1)
+        J[:, 2, 2] = -self.K[0, 0] * (points[:, 0] - self.baseline) / np.maximum(points[:, 2], NEAR) ** 2
         return J
 
 
@@ -194,9 +186,7 @@ def linearised(
     rig: StereoRig, poses: NDArray[np.float64], points: Points, seen: Sightings, offset: float, sigma: float, fixed: int
 ) -> tuple[PosesAndPoints, NDArray[np.float64]]:
     """Returns the sightings of points (M, 3) from poses (W, 4, 4) linearised, and their squared errors (S,)."""
-    inverse = np.array([invert(T) for T in poses])
-    R = inverse[seen.frames, :3, :3]
-    p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
+    p, R = in_cameras(poses, points, seen.frames, seen.points)
     r = (rig.project(p) - seen.pixels + np.array([0.0, 0.0, offset])) / sigma
     squared = np.einsum("si,si->s", r, r)
     weight = np.where(p[:, 2] > NEAR, cauchy(squared / (3.0 * CAUCHY**2)), 0.0)
