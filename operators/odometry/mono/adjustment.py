@@ -9,24 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.estimation.bundle import PosesAndPoints, in_cameras, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, Sightings, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Pixels, Points, project_clamped, projection_jacobian
+from operators.geometry.pinhole import Points, project_clamped, projection_jacobian
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 NEAR = 1e-3  # of the map's unit; nearer points are behind or in the lens
-
-
-@dataclass(frozen=True, eq=False)
-class Views:
-    """Holds observations: frames (S,) and points (S,) by index, pixels (S, 2)."""
-
-    frames: NDArray[np.int64]
-    points: NDArray[np.int64]
-    pixels: Pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +42,7 @@ class _Errors:
 
 
 def adjust(
-    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, sigma: float, fixed: int, iterations: int
+    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, sigma: float, fixed: int, iterations: int
 ) -> Adjusted:
     """Improves poses T_world_camera (W, 4, 4) after the first `fixed` ones, and points (M, 3) in the world.
 
@@ -73,8 +64,8 @@ def adjust(
     return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, now.squared)
 
 
-def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, sigma: float) -> _Errors:
-    p, R = in_cameras(poses, points, seen.frames, seen.points)
+def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, sigma: float) -> _Errors:
+    p, R = seen.in_cameras(poses, points)
     r = (project_clamped(p, K, NEAR) - seen.pixels) / sigma
     # What lies behind counts as a constant, so that no step gains by putting a point there.
     chi = np.where(p[:, 2] > NEAR, (r * r).sum(axis=1), 1e6)
@@ -82,7 +73,7 @@ def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, 
 
 
 def _step(
-    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, at: _Errors, sigma: float, fixed: int,
+    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, at: _Errors, sigma: float, fixed: int,
     damping: float,
 ) -> tuple[NDArray[np.float64], Points]:  # fmt: skip
     """Returns poses and points after a damped step of Gauss and Newton."""

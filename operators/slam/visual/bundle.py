@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
-from operators.estimation.bundle import PosesAndPoints, in_cameras, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, Sightings, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
@@ -45,13 +45,10 @@ WRONG = 25.0  # squared sigmas of a pixel beyond which a sighting is of somethin
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
-    """Observations of point (S,) by view (S,), at what pixel (S, 2) of the colour camera and depth (S,) in the depth
-    camera, metres, NaN where unknown; and how noisy a pixel is and each depth (S,)."""
+class Observations(Sightings):
+    """Sightings at pixels (S, 2) of the colour camera with depths (S,) in the depth camera, metres, NaN where unknown;
+    and how noisy a pixel is and each depth (S,)."""
 
-    views: Indices
-    points: Indices
-    pixels: Array
     depths: Array
     sigma_pixel: float
     sigma_depths: Array
@@ -101,7 +98,7 @@ class _Solver:
     def residuals(self, poses: Array, points: Points) -> tuple[Array, Array, Array, Array]:
         """Returns points in the depth cameras (S, 3), residuals (S, 3) in sigmas, their squares (S, 2), R (S, 3, 3)."""
         seen, K, T_color = self.seen, self.camera.K_color, self.camera.T_color_depth
-        p, R = in_cameras(poses, points, seen.views, seen.points)
+        p, R = seen.in_cameras(poses, points)
         c = transform_points(T_color, p)
         r = np.empty((len(p), 3))
         r[:, :2] = (project_clamped(c, K, NEAR) - seen.pixels) / seen.sigma_pixel
@@ -120,7 +117,7 @@ class _Solver:
         by_color = projection_jacobian(transform_points(T_color, p), self.camera.K_color, NEAR)
         J[:, :2] = by_color / seen.sigma_pixel @ T_color[:3, :3]
         J[:, 2, 2] = 1.0 / seen.sigma_depths
-        system = PosesAndPoints(seen.views - fixed, seen.points, (count, size), pose_jacobian(J, p), J @ R, r, weights)
+        system = PosesAndPoints(seen.frames - fixed, seen.points, (count, size), pose_jacobian(J, p), J @ R, r, weights)
         system.damp_points(0.0, 1e-6)
         S, g = system.reduced()
         of_edges, pull = graph.normal(poses)
