@@ -15,10 +15,11 @@ from operator_runs import assert_resumes_alike, largest_errors
 
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert, transform_points
+from operators.estimation.bundle import Sightings
 from operators.geometry import se3
 from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
-from operators.odometry.stereo.adjustment import Offset, Past, Sightings, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, adjust, fitting
 from operators.odometry.stereo.odometry import rig_of
 from operators.odometry.stereo.relocalizer import FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -184,16 +185,15 @@ def test_a_point_is_seen_where_the_rig_projects_it_and_found_again_from_there() 
 
 
 def test_sightings_are_kept_by_point_and_go_with_their_frame() -> None:
-    two = (
-        Sightings.none().also(0, np.array([0, 2]), np.full((2, 3), 1.0)).also(1, np.array([1, 2]), np.full((2, 3), 2.0))
-    )
+    one = Sightings.none(3).also(0, np.array([0, 2]), np.full((2, 3), 1.0))
+    two = one.also(1, np.array([1, 2]), np.full((2, 3), 2.0))
     some = two.of_points(np.array([2, 0]))
     assert (some.frames.tolist(), some.points.tolist()) == ([0, 0, 1], [1, 0, 0])
     assert some.pixels[:, 0].tolist() == [1.0, 1.0, 2.0]
     later = two.without_first()
     assert (later.frames.tolist(), later.points.tolist(), later.pixels[:, 0].tolist()) == ([0, 0], [1, 2], [2.0, 2.0])
     squared = np.array([3.0, 14.0, 14.0, 9.0])  # of points 0, 2, 1, 2
-    assert two.fitting(squared, 4).tolist() == [True, False, True, False]
+    assert fitting(two, squared, 4).tolist() == [True, False, True, False]
 
 
 def test_pose_information_relinearizes_at_nearby_poses() -> None:
