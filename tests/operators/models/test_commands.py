@@ -32,7 +32,7 @@ def one(served: Served, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_list_shows_licences_and_availability(one: Served) -> None:
     code, out, _ = run("list", "--task", "detection")
     assert code == 0
-    rows = {line.split()[0]: line for line in out.splitlines()[1:]}
+    rows = {line.split()[0]: line for line in reversed(out.splitlines()[1:])}  # a wrapped line may begin with a name
     assert "CC-BY-4.0" in out  # wrapped in a narrow terminal
     assert " no " in rows["net"]
     assert " yes " in rows["simulated"]
