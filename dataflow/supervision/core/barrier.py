@@ -7,7 +7,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, RunState, notice
+from dataflow.supervision.core.run_state import RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 
 HEARD_WITHIN = 30.0
@@ -21,7 +21,7 @@ class Barrier:
         self.run = run
         self._deadline = 0.0
         self._probing = False
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
 
     def begin(self) -> None:
         run = self.run

@@ -12,7 +12,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import Life, Step
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, Phase, RunState, notice
+from dataflow.supervision.core.run_state import Phase, RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 
 LEAVE_TIMEOUT = 10.0
@@ -38,7 +38,7 @@ class Closing:
         self.run, self.outcome, self.failure = run, outcome, failure
         self._at_once = at_once
         self._hand_over = hand_over
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
         self._deadline = 0.0
         run.enter(Phase.CLOSING)
         self._begin(sinks=False)

@@ -210,7 +210,7 @@ def notice(timeout: float) -> float:
     return min(ASK_BEFORE, timeout / 5)
 
 
-class Asking:
+class StackTraceRequests:
     """Asks each process where it is, once for each time that it is stuck, before it is given up: what its threads are
     at becomes part of its last words."""
 

@@ -13,7 +13,7 @@ from dataflow.supervision.core.life import WORKS, Life
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.supervised import Supervised
-from dataflow.supervision.core.watchers.flow_control import LiveCover
+from dataflow.supervision.core.watchers.flow_control import LiveFlowControl
 from dataflow.supervision.core.watchers.restarts import RestartPolicy
 from dataflow.supervision.core.watchers.watcher import Watcher
 
@@ -25,7 +25,7 @@ HUNG_AFTER = 5.0
 class Heartbeats(Watcher):
     """Takes in what the watchdogs of the processes say."""
 
-    def __init__(self, run: RunState, cover: LiveCover, restarts: RestartPolicy) -> None:
+    def __init__(self, run: RunState, cover: LiveFlowControl, restarts: RestartPolicy) -> None:
         super().__init__(run)
         self._cover, self._restarts = cover, restarts
         self._beats: dict[str, float] = {}

@@ -7,7 +7,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import WORKS
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, RunState, notice
+from dataflow.supervision.core.run_state import RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.lateness import how_long
 from dataflow.supervision.core.watchers.quiescence import Quiescence
@@ -26,7 +26,7 @@ class StallWatch(Watcher):
         super().__init__(run)
         self.quiescence = quiescence
         self._heard = 0.0
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
 
     def released(self) -> None:
         self._heard = self.run.steady
@@ -91,7 +91,7 @@ class LiveStallWatch(StallWatch):
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run, quiescence)
         self._signs: dict[str, float] = {}
-        self._asking_silent = Asking(run)
+        self._asking_silent = StackTraceRequests(run)
         graph = run.graph
         self._flowing = {s for node in graph.sources() for s in node.outputs.values() if not graph.streams[s].static}
         """The streams of sources that have not ended."""
