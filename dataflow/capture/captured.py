@@ -47,7 +47,7 @@ class Change(NamedTuple):
     """(incarnation, stamp in ns)."""
 
 
-class Shot(NamedTuple):
+class CapturedCall(NamedTuple):
     """One call: what it was given, what was recorded of its effects and, by port, of its outputs (digests), and the
     changes between the call before and this one. `here`: the digests of its outputs in the debugger."""
 
@@ -116,7 +116,7 @@ class Captured:
     at_setup: Mapping[str, Any]
     since: Mapping[str, Any]
     state: bytes | None
-    shots: tuple[Shot, ...]
+    shots: tuple[CapturedCall, ...]
     expected: Mapping[str, Message] | None = None
     recorded_error: str = ""
     predicate: str = ""
@@ -277,7 +277,7 @@ def check(path: Path) -> None:
         raise AssertionError(f"in the environment {env}: {done.stderr.strip() or f'exit code {done.returncode}'}")
 
 
-def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outcome:
+def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[CapturedCall]) -> Outcome:
     """Makes the calls, to the last or to the first that raises."""
     ports = tuple(calls.node.outputs)
     before: deque[dict[str, bytes]] = deque(maxlen=BEFORE)
@@ -327,7 +327,7 @@ def _differences(expected: Mapping[str, Message], outputs: Mapping[str, Message]
     return found
 
 
-def _packed(shot: Shot, kept: Any) -> dict[str, Any]:
+def _packed(shot: CapturedCall, kept: Any) -> dict[str, Any]:
     firing = shot.firing
     entries = {
         name: [_form(given), [[e.stream, e.seq, e.incarnation, kept(e.value)] for e in entries_of(given)]]
@@ -351,7 +351,7 @@ def _form(given: InputValue) -> str:
     return "one" if isinstance(given, Entry) else "by stream" if isinstance(given, Mapping) else "all"
 
 
-def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> Shot:
+def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> CapturedCall:
     inputs: dict[str, InputValue] = {}
     for name, (form, listed) in values["inputs"].items():
         entries = tuple(
@@ -364,4 +364,4 @@ def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> Sho
         values["stamp"], values["kind"], values["tick"], inputs, frozenset(values["stale"]), frozenset(values["late"])
     )
     changes = tuple(Change(kind, name, value, tuple(place)) for kind, name, value, place in values["changes"])
-    return Shot(firing, values["effects"], {}, changes)
+    return CapturedCall(firing, values["effects"], {}, changes)

@@ -22,7 +22,7 @@ from dataflow.records.reading import FiringLog
 
 
 @dataclass(slots=True)
-class Loss:
+class LostMessages:
     """Messages of a stream that are known to have been there, by their numbers or an index, and cannot be read.
 
     `after`: the stamp (ns) of the last saved message before the first of them; None where there is none, or it is not
@@ -45,7 +45,7 @@ class Recovered:
     torn: bool
     lost_bytes: int
     damage: list[str] = field(default_factory=list)
-    lost: list[Loss] = field(default_factory=list)
+    lost: list[LostMessages] = field(default_factory=list)
 
     @property
     def whole(self) -> bool:
@@ -94,17 +94,17 @@ def recover(
         return Recovered(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
 
 
-def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[Loss]:
+def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[LostMessages]:
     """Yields the messages that an index lists in chunks that cannot be read."""
     for channel, mask in sorted(kept.items(), key=lambda item: origin.channels[item[0]].topic):
         if not mask.all():
             times = origin.entries(channel).times
             before = times[mask][times[mask] < times[~mask].min()]
             topic = origin.channels[channel].topic
-            yield Loss(topic, int((~mask).sum()), int(before.max()) if len(before) else None)
+            yield LostMessages(topic, int((~mask).sum()), int(before.max()) if len(before) else None)
 
 
-def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterator[Loss]:
+def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterator[LostMessages]:
     """The numbers that are missing in streams, up to the last one that is saved or that a firing record names."""
     found: dict[tuple[str, int], dict[int, int]] = {}
     streams = origin.of_kind(Kind.STREAM)
@@ -125,7 +125,7 @@ def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterat
         missing = [n for n in range(first, last + 1) if n not in numbers]
         if missing:
             before = [stamp for number, stamp in numbers.items() if number < missing[0]]
-            yield Loss(stream, len(missing), max(before, default=None))
+            yield LostMessages(stream, len(missing), max(before, default=None))
 
 
 def _told(path: Path) -> dict[tuple[str, int], int]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from dataflow.editing.recover import Loss, Recovered
+from dataflow.editing.recover import LostMessages, Recovered
 from dataflow.editing.report import Edited
 from dataflow.interop.salvage import salvage
 from dataflow.interop.typestores import RosType
@@ -44,7 +44,7 @@ def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> 
     saved: Counter[str] = Counter()
     for number, count in counts.items():
         saved[topics[number].name] += count
-    lost = [Loss("", found.lost, None)] if found.lost else []
+    lost = [LostMessages("", found.lost, None)] if found.lost else []
     edited = Edited(str(out), dict(sorted(saved.items())), out.stat().st_size, span)
     return Recovered(edited, True, 0, found.notes, lost)
 

@@ -19,8 +19,8 @@ from dataflow.execution.admission import (
     Clock,
     EventClock,
     EventTime,
-    Patience,
-    Promise,
+    Frontier,
+    WaitLimits,
     dropped,
 )
 from dataflow.execution.calls import Calls, interrupted_after
@@ -83,7 +83,7 @@ class LiveRunner(OperatorRunner):
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
         self._time = EventTime(event_clock or time.time_ns)
-        self.patience = Patience(node.live.wait, clock, self._time.until)
+        self.patience = WaitLimits(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
@@ -157,12 +157,12 @@ class LiveRunner(OperatorRunner):
             self._admit(stream, entry)
 
     def advance(self, stream: str, frontier: int) -> None:
-        self._promised(stream, Promise(frontier))
+        self._promised(stream, Frontier(frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._promised(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+        self._promised(stream, Frontier(NEVER if final_stamp is None else final_stamp, True, reason))
 
-    def _promised(self, stream: str, promise: Promise) -> None:
+    def _promised(self, stream: str, promise: Frontier) -> None:
         self.wake()
         if stream in self.queue.triggers:
             self.queue.promise(stream, promise)

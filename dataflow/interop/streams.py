@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.interop.account import Account
-from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
+from dataflow.interop.bag import Bag, BagError, DamageReport, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.opening import open_bag
@@ -23,7 +23,7 @@ from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
 from dataflow.messages.depth_units import MILLIMETRES, DepthSpan
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
-from dataflow.recording.streams.streams import Unread
+from dataflow.recording.streams.streams import UnreadableMessages
 
 MAX_HELD = 1 << 30
 """Bytes of messages that wait for earlier ones, which the log has later."""
@@ -71,11 +71,11 @@ class BagStreams:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
             self._readings = {p.topic: self._reading(p) for p in self.played.values()}
             self._readers = {topic: r.reader for topic, r in self._readings.items() if r.reader is not None}
-            self._unstamped: dict[str, Unread] = {}
+            self._unstamped: dict[str, UnreadableMessages] = {}
             self._depths: dict[str, list[npt.NDArray[np.float32]]] = {}
             self._moving = sorted({p.topic for p in self.played.values() if not p.static})
             self._found = self._scan(watch)
-            self._unstamped = {topic: Unread(u.count, u.reason) for topic, u in self.account.unread.items()}
+            self._unstamped = {topic: UnreadableMessages(u.count, u.reason) for topic, u in self.account.unread.items()}
             times = [found.times(self._bag.topics[t], self._readings[t].merges) for t, found in self._found.items()]
             self.clock: Clock = choose_clock(times, clock)
             self.repairs: Mapping[str, Repair] = {
@@ -102,7 +102,7 @@ class BagStreams:
         return False
 
     @property
-    def lost(self) -> Lost:
+    def lost(self) -> DamageReport:
         """Messages that damage keeps from being read, as far as they have been read."""
         return self._bag.lost
 

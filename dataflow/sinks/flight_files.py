@@ -17,7 +17,7 @@ from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import FLIGHT
-from dataflow.records.cuts import Held
+from dataflow.records.cuts import OrphanedMessage
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 
@@ -33,7 +33,7 @@ class Segment:
 
     path: Path
     begin: int | None
-    held: Mapping[str, list[Held]]
+    held: Mapping[str, list[OrphanedMessage]]
 
 
 class FlightFiles:

@@ -14,7 +14,7 @@ from sys import modules
 from typing import TYPE_CHECKING
 
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Fired
+from dataflow.debugging.fired import RepeatedCall
 from dataflow.debugging.suspects import recorded_code, recorded_text
 from dataflow.environments import EnvError
 from dataflow.execution.failure import OperatorFailure, readable
@@ -51,11 +51,13 @@ class Changes:
     raised: list[tuple[int, str]] = field(default_factory=list)
 
 
-def changes_of(debugger: Debugger, may: Callable[[Fired], bool], may_raise: Callable[[Fired], bool]) -> Changes:
+def changes_of(
+    debugger: Debugger, may: Callable[[RepeatedCall], bool], may_raise: Callable[[RepeatedCall], bool]
+) -> Changes:
     """Makes all calls of an operator. `may` and `may_raise` say of one that differs whether that is allowed."""
     found = Changes()
 
-    def visit(each: Fired) -> bool:
+    def visit(each: RepeatedCall) -> bool:
         if not each.same:
             found.changed.append(each.number)
             if each.raised is not None and not may_raise(each):

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, Offer, _steered, keys, looped, pressed
+from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, KeyBindings, _steered, keys, looped, pressed
 from dataflow.execution.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
@@ -105,7 +105,7 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     ids=["flight recorder", "no flight recorder", "live"],
 )
 def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, offers: tuple[Offer, ...], meant: list[str]
+    monkeypatch: pytest.MonkeyPatch, offers: tuple[KeyBindings, ...], meant: list[str]
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []

@@ -93,10 +93,10 @@ def opened_streams(path: Path, clock: Choice, *, strict: bool = False) -> Record
     if not is_foreign(path):
         refuse_of_recording(path, clock, strict=strict)
         return Recording(path)
-    from dataflow.interop.playing import Wishes, readable
+    from dataflow.interop.playing import BagReadOptions, readable
 
     with closing(open_bag(path, strict=strict)) as bag:
-        streams = readable(bag, path, clock, wishes=Wishes(strict=strict))
+        streams = readable(bag, path, clock, wishes=BagReadOptions(strict=strict))
     say(f"[dim]stamps: {escape(streams.clock.kind)}: {escape(streams.clock.why)}[/]")
     say_account(streams)
     return streams

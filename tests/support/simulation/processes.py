@@ -9,7 +9,7 @@ from typing import Any
 from dataflow.process.channel import QueuedChannel
 from dataflow.supervision.nursery import Child, ChildExited, Orphans
 from dataflow.supervision.process_main import main
-from simulation.machine import ChildExited as PipeEnd
+from simulation.machine import End as PipeEnd
 from simulation.machine import Handle, Socket, System, Waiters
 from simulation.world import Killed, Process, World
 
