@@ -16,13 +16,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
-from dataflow.blame.again import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
 from dataflow.blame.field import Field, differ, is_measured
 from dataflow.blame.line import Call, Line
 from dataflow.blame.links import Chain, Effect, Link, Way
 from dataflow.blame.nudge import nudged
-from dataflow.blame.others import ANOTHER, SubstituteMessages, TakenMessage, without
+from dataflow.blame.repeated_calls import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
 from dataflow.blame.split import split
+from dataflow.blame.substitutes import ANOTHER, SubstituteMessages, TakenMessage, without
 from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from dataflow.blame.again import Place
 from dataflow.blame.field import change, is_measured
 from dataflow.blame.line import Call
 from dataflow.blame.nudge import SIZE
+from dataflow.blame.repeated_calls import Place
 
 Way = Literal["nudged", "made finite", "the one before", "left out", "another", "call left out", "a new operator"]
 """The change of an input, or of the calls before."""

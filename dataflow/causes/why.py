@@ -21,9 +21,9 @@ from dataflow.records.comparison import Verification
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
-from dataflow.verification.books import Books
 from dataflow.verification.choice import accountable, env_of
 from dataflow.verification.ledger import incomplete_streams
+from dataflow.verification.record_totals import GraphRecordTotals
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.workers.processes import Call, Workers, call_workers
 
@@ -226,7 +226,7 @@ class _Alone:
         with Recording(path) as recording:
             played = graph or graph_that_is_here(recording)[0]
             log = FiringLog.read(recording)
-            books = Books(log, played)
+            books = GraphRecordTotals(log, played)
             told = [each for each in played.nodes if accountable(recording, played, books, each)]
             incomplete = incomplete_streams(recording, played, books, told)
             held = recording.streams.keys() - incomplete

@@ -9,7 +9,7 @@ from typing import Any
 
 import xxhash
 
-from dataflow.drops.distant import operator_of
+from dataflow.drops.operator_process import operator_of
 from dataflow.execution.calls import Calls, Place
 from dataflow.execution.effects.journal import EFFECTS
 from dataflow.graph.model import Graph, Node

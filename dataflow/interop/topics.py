@@ -8,13 +8,13 @@ from functools import partial
 from itertools import islice
 from typing import Any, Protocol
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.bag import Bag, Topic
 from dataflow.interop.ros import CONVERSIONS, TRANSFORM_SETS, Convert
 from dataflow.interop.ros.clouds import point_cloud
 from dataflow.interop.ros.poses import transforms
 from dataflow.interop.ros.sensors import number
 from dataflow.interop.ros.values import time_ns
-from dataflow.interop.seen import TrackedMessage
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording.errors import RecordingError

@@ -39,7 +39,7 @@ LEAST = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SummaryRelation:
     """A relation between two nodes, by index. `score` is 1 where the graph has none."""
 
     subject: int
@@ -62,10 +62,10 @@ class SceneSummary:
     - `rooms`: by node of a room where there are several, the nodes that are in it.
     """
 
-    carriers: Mapping[int, Told]
+    carriers: Mapping[int, SummaryRelation]
     children: Mapping[int, Sequence[int]]
-    telling: tuple[Told, ...]
-    intentions: tuple[Told, ...]
+    telling: tuple[SummaryRelation, ...]
+    intentions: tuple[SummaryRelation, ...]
     agents: frozenset[int] = frozenset()
     places: frozenset[int] = frozenset()
     tops: frozenset[int] = frozenset()
@@ -94,7 +94,7 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
     tops = frozenset(s for s, p, o in graph.relations() if p == "part_of" and ids[s] <= 0 < ids[o])
     scores = [1.0] * len(graph.subjects) if graph.relation_scores is None else graph.relation_scores.tolist()
     every = [
-        Told(s, p, o, score)
+        SummaryRelation(s, p, o, score)
         for (s, p, o), score in zip(graph.relations(), scores, strict=True)
         if s != o and p not in SURROUNDINGS and ids[o] >= ROOMS
     ]
@@ -112,7 +112,7 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
         del counts[commonest]
         rest = [r for r in rest if r.predicate != commonest]
     rest.sort(key=lambda r: (r.subject not in agents, -r.score, r.subject, r.object))
-    told: list[Told] = []
+    told: list[SummaryRelation] = []
     for r in rest:
         before = any((r.subject, r.predicate) == (other.subject, other.predicate) for other in told)
         if not (before and r.subject in agents):
@@ -125,9 +125,9 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
     return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions), agents, places, tops, rooms)
 
 
-def _carriers(relations: Sequence[Told], tops: Collection[int]) -> dict[int, Told]:
+def _carriers(relations: Sequence[SummaryRelation], tops: Collection[int]) -> dict[int, SummaryRelation]:
     """The strongest carrier of each node, a thing before its top; a relation that would close a loop is left out."""
-    carriers: dict[int, Told] = {}
+    carriers: dict[int, SummaryRelation] = {}
     for relation in sorted(
         relations, key=lambda r: (r.object in tops, -r.score, CARRYING.index(r.predicate), r.subject, r.object)
     ):

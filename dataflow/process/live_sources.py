@@ -20,7 +20,7 @@ from dataflow.execution.feeds.window import TransferCounters, Window
 from dataflow.execution.restarts import Restarts
 from dataflow.execution.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
-from dataflow.process.awake import LOOK_EVERY, AwakeClock
+from dataflow.process.awake_clock import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.log_pipe import SOURCE_THREAD, tell_outlived
 from dataflow.process.streams.inbox import Inbox

@@ -21,7 +21,7 @@ from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.build import build, open_box
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig

@@ -19,7 +19,7 @@ from dataflow.graph.model import Graph
 from dataflow.graph.sections import Flight
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.parts import Storage
 from dataflow.records.cuts import OrphanedMessage

@@ -19,7 +19,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.priority import let_others_begin
 from dataflow.process.streams.inbox import Inbox

@@ -32,7 +32,7 @@ from dataflow.machines.gate import Gate, Routes, Word
 from dataflow.machines.hub import POOL_BYTES, machine_key, router
 from dataflow.machines.keys import settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.descriptors import take_descriptors
 from dataflow.process.streams.inbox import Inbox
 from dataflow.recording.streams.facts import machine_facts

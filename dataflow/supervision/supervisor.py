@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from dataflow.environments import EnvError
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
-from dataflow.process.awake import LONGEST_STEP, AwakeClock
+from dataflow.process.awake_clock import LONGEST_STEP, AwakeClock
 from dataflow.process.log_pipe import heard, shown
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children

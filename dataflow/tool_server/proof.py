@@ -33,7 +33,7 @@ EQUAL = ("use", "params", "inputs", "env")
 
 
 @dataclass
-class Others:
+class OtherOperators:
     """The operators besides the mended one, and what that is given. `reasons`: why the fix is not proven, by operator;
     `unrepeated`: those that do not repeat with the code that was recorded either, and why that is known."""
 
@@ -81,10 +81,10 @@ def unmade(verification: Verification) -> str:
     return f"{count:,} of {verification.firings:,} calls could not be made again ({why})"
 
 
-def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str) -> Others:
+def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str) -> OtherOperators:
     """Judges a verification of all operators with a fix, in the code or the graph, of the one that is `mended`."""
     recorded = graph_that_is_here(recording)[0]
-    others = Others(dict.fromkeys(report.absent, "not re-executed"))
+    others = OtherOperators(dict.fromkeys(report.absent, "not re-executed"))
     following = list[str]()
     for v in report.operators:
         name = v.operator
@@ -105,7 +105,7 @@ def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str)
 
 
 def _judge_culprit(
-    others: Others, recording: Recording, report: VerifyReport, recorded: Graph, graph: Graph, v: Verification
+    others: OtherOperators, recording: Recording, report: VerifyReport, recorded: Graph, graph: Graph, v: Verification
 ) -> None:
     """Judges an operator that differs although it was given what was recorded."""
     how = {False: "differs each time", True: "differs alike each time", None: "differs"}[report.repeats(v.operator)]

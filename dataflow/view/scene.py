@@ -42,7 +42,7 @@ class Placed:
 
 
 @dataclass(slots=True)
-class Unshown:
+class HiddenFrames:
     """The newest offer for each frame of streams that are not shown; an estimate goes before truth.
 
     One is taken where something shown needs it and nothing shown gives it: a hidden stream must not take the frames of
@@ -138,7 +138,7 @@ class SceneState:
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
     videos: dict[str, PacketDecoder] = field(default_factory=dict)
     """By stream, the decoder of its packets."""
-    unshown: Unshown = field(default_factory=Unshown)
+    unshown: HiddenFrames = field(default_factory=HiddenFrames)
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     begin: int | None = None
     """The stamp (ns) of the first message that was drawn."""

@@ -15,6 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import get_types_from_msg
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.bag import BagError
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
@@ -22,7 +23,6 @@ from dataflow.interop.export.ros2 import export_ros2
 from dataflow.interop.export.source import ExportSource
 from dataflow.interop.opening import open_bag
 from dataflow.interop.playing import BagReadOptions, readable
-from dataflow.interop.seen import TrackedMessage
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.messages import Image, Image16, Measurement, Number, PointCloud, RangeReading
 from dataflow.recording import Recording

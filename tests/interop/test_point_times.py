@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from made_bags import SECOND, header, ros, xyzw
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.ros.clouds import point_times
 from dataflow.interop.ros.images import camera_info, compressed
 from dataflow.interop.ros.poses import transforms
 from dataflow.interop.ros.sensors import imu, joint_state, nav_sat_fix
-from dataflow.interop.seen import TrackedMessage
 from dataflow.messages import CompressedDepth, CompressedImage
 from dataflow.recording import RecordingError
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from dataflow.view.frames import Rank
-from dataflow.view.viewpoint import Outlook
+from dataflow.view.viewpoint import ViewerPose
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     from dataflow.view.scene import SceneState
 
 
-def in_image(looked: Outlook, points: np.ndarray) -> np.ndarray:
+def in_image(looked: ViewerPose, points: np.ndarray) -> np.ndarray:
     """Where points are in a view of 50 degrees that is 1.2 times as wide as high: its edges are at -1 and 1."""
     assert looked.position is not None
     assert looked.target is not None
@@ -27,11 +27,11 @@ def in_image(looked: Outlook, points: np.ndarray) -> np.ndarray:
     return np.where(depth > 0, np.array([x / depth / (1.2 * half), y / depth / half]), np.inf)
 
 
-def in_view(looked: Outlook, points: np.ndarray) -> bool:
+def in_view(looked: ViewerPose, points: np.ndarray) -> bool:
     return bool(np.abs(in_image(looked, points)).max() < 1)
 
 
-def fills(looked: Outlook, points: np.ndarray) -> float:
+def fills(looked: ViewerPose, points: np.ndarray) -> float:
     """The larger share of the view's width and height that points take up."""
     return float(np.ptp(in_image(looked, points), axis=1).max() / 2)
 

@@ -12,10 +12,10 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.sweep import AS_USUAL, Recordings, WorkOptions, print_torn, torn_of, work
-from dataflow.cli.support.again import take_environment
 from dataflow.cli.support.arguments import Json, Overwrite, find_modules_in, graph_file, output_file
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import count, fail, out, plural, print_json, table
+from dataflow.cli.support.repeated_calls import take_environment
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 

@@ -15,8 +15,8 @@ from dataflow.cli.support.options import option
 from dataflow.cli.support.output import DIFFERENT, count, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
+    from dataflow.lint.checks import Report
     from dataflow.lint.inputs import LintInput
-    from dataflow.lint.look import Report
 
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -53,8 +53,8 @@ def lint(
       dataflow lint run.mcap --contract robot.yaml --json
       dataflow lint rosbag2_folder --quick
     """
+    from dataflow.lint.checks import lint as look
     from dataflow.lint.contract import load_contract, proposed
-    from dataflow.lint.look import lint as look
 
     if write is not None:
         output_file(write, ".yaml", overwrite=overwrite, option="--write-contract")

@@ -12,10 +12,10 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.again import CodeOptions
 from dataflow.cli.support.arguments import Json, check_offset, existing, offset, output_file
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import COULD_NOT_RUN, DIFFERENT, err, fail, out, own_traceback, print_json, say
+from dataflow.cli.support.repeated_calls import CodeOptions
 from dataflow.cli.support.run_options import MakeEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:

@@ -163,7 +163,7 @@ def interrupted_by_user(error: BaseException | None) -> bool:
 
 _KNOWN = {
     *("BaselineError", "BusError", "ChaosError", "ContractError", "EnvError", "FoxgloveError", "KeysError"),
-    *("MappingError", "MessageError", "NameFault", "NetworkError", "NotRunning", "OperatorImportError"),
+    *("MappingError", "MessageError", "InvalidName", "NetworkError", "NotRunning", "OperatorImportError"),
     *("ParameterError", "RecordingError", "RegistryError", "ReplayError", "SweepError", "ViewerError", "WrongCommand"),
 }
 """Errors of this package whose messages tell users what they can do."""

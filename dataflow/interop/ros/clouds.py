@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.interop.seen import lose
+from dataflow.interop.access_tracking import lose
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.pixels import rows_without_padding

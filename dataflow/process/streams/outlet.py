@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import Channel
 from dataflow.process.config import Resumed
 from dataflow.process.streams.recent import RecentFirings

@@ -13,7 +13,7 @@ from dataflow.messages.geometry import quaternion_to_matrix
 from dataflow.messages.scene_summary import (
     Row,
     SceneSummary,
-    Told,
+    SummaryRelation,
     agents_in_words,
     carriers_in_words,
     class_names,
@@ -173,9 +173,9 @@ def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: se
         canvas.draw("space/relations", message.frame, lines)
 
 
-def _intentions(canvas: Canvas, message: SceneGraph, intentions: Sequence[Told]) -> None:
+def _intentions(canvas: Canvas, message: SceneGraph, intentions: Sequence[SummaryRelation]) -> None:
     """An arrow from each agent to its likeliest goals, the brighter the likelier, with the probability."""
-    likely: list[Told] = []
+    likely: list[SummaryRelation] = []
     for r in intentions:
         if r.score >= _LIKELY and sum(other.subject == r.subject for other in likely) < _GOALS:
             likely.append(r)

@@ -30,7 +30,16 @@ from operators.fusion.filter.error_state import (
     shifted,
     updated,
 )
-from operators.fusion.filter.gate import PLACES, Doubt, GateConfig, Health, judge, leap, repeat_of, threshold
+from operators.fusion.filter.gate import (
+    PLACES,
+    GateConfig,
+    Health,
+    RejectedMeasurement,
+    judge,
+    leap,
+    repeat_of,
+    threshold,
+)
 from operators.fusion.filter.history import Command, Entry, Hypothesis, Node, Restart, Sample
 from operators.fusion.filter.hypotheses import combined, doubted, likely, moves, reduced, refuted, with_errors
 from operators.fusion.filter.measurements import Measurement
@@ -314,7 +323,7 @@ class ErrorStateFilter(Remembered):
             hypotheses = _brought(hypotheses, found)
             found, scores, best = self._found(entry, hypotheses, node)
         health = replace(health, repeat=repeat_of(health.repeat, entry, state, fits))
-        doubt = Doubt(entry.time, residual, entry.noise, kind)
+        doubt = RejectedMeasurement(entry.time, residual, entry.noise, kind)
         unfelt = self._config.unfelt
         nis = scores[best][0]
         leapt = 0.0 if unfelt is None else leap(config, entry.sensor, doubt, node.health, state, H, nis, unfelt)

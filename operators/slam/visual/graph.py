@@ -15,7 +15,7 @@ from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
 from operators.slam.place_graph import WINDOW, PlaceGraph
-from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting
+from operators.slam.sensor_model import Eyes, KeyframeResult, PlaceSettings, Sighting
 from operators.slam.visual.bundle import adjust_newest
 from operators.slam.visual.map_points import MapPoints
 from operators.slam.visual.place_index import PlaceIndex
@@ -90,7 +90,7 @@ class VisualGraph(PlaceGraph[View]):
         self._judge = settings.judge
         self.points = MapPoints()
 
-    def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
+    def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> KeyframeResult:
         """Takes a keyframe of the odometry, and what fits its poses.
 
         `found_again`: the odometry has found its own map again, so that its pose jumped.

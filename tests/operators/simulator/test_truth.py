@@ -20,7 +20,7 @@ from operators.simulator.people.persons import Person
 from operators.simulator.relations import PLACEMENT, SPATIAL
 from operators.simulator.rendering.optics import Optics
 from operators.simulator.rendering.renderer import Renderer
-from operators.simulator.scene import Builder, Light, Still, World
+from operators.simulator.scene import Builder, Light, Stationary, World
 from operators.simulator.shapes import Material, bounds, box, pose
 from operators.simulator.things.furnishing import FLOOR
 from operators.simulator.things.furniture import rover
@@ -243,7 +243,7 @@ def test_degrees_of_nearness_follow_their_written_thresholds(
 def test_placement_does_not_depend_on_where_things_are(robot: SimulatedRobot) -> None:
     """Objects set far apart keep their relations of placement: no distance decides them."""
     world = robot._stage.world
-    away = [replace(thing, mover=Still(pose(50.0 * k, 0, 0))) for k, thing in enumerate(world.things)]
+    away = [replace(thing, mover=Stationary(pose(50.0 * k, 0, 0))) for k, thing in enumerate(world.things)]
     assert replace(world, things=tuple(away)).relations(0.0) == world.relations(0.0)
 
 

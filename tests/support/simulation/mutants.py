@@ -16,7 +16,7 @@ from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
 from dataflow.machines.pipe import _END, _FRAME, Pipe
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.streams.losses import LossReportingPolicy
 from dataflow.sinks.flight_recorder import FlightSink, PendingSpan

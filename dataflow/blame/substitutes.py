@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from dataflow.blame.again import Slot
 from dataflow.blame.line import Call
 from dataflow.blame.links import Way
 from dataflow.blame.nudge import groups, is_finite, made_finite, nudged
+from dataflow.blame.repeated_calls import Slot
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
