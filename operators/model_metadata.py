@@ -19,7 +19,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ImageMetadata:
-    """Labels, mean and deviation (shares of 1) from a model's metadata, each None where these do not tell."""
+    """Labels, mean and deviation (shares of 1) from a model's metadata, each None where it is missing."""
 
     labels: Labels | None
     mean: Triple | None

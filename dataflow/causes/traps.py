@@ -112,7 +112,7 @@ class Traps:
     def set(self) -> None:
         """Begins to log, in this thread and in those to come."""
         NumpyEntropy.install()
-        lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows who draws
+        lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows which call draws
         look_through(looking_at)
         sys.addaudithook(self._audited)
         threading.setprofile(self._called)

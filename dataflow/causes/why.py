@@ -124,7 +124,7 @@ def why(
     """Finds the causes for which an operator does not repeat, by at most `MOST` re-runs of it alone.
 
     `report`: that of verifying the recording (with `graph`, if it was verified against another). `seconds`: time for
-    the calls of one re-run; `stall_timeout`: seconds allowed without progress. `progress` is told of each re-run. An
+    the calls of one re-run; `stall_timeout`: seconds allowed without progress. `progress` is called for each re-run. An
     operator that cannot be re-run, or that makes what was recorded, is refused, with the reason.
     """
     began = time.monotonic()

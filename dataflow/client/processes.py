@@ -201,5 +201,5 @@ def processes_of(found: RunningGraph) -> Iterator[Processes]:
     try:
         yield Processes(bus, found.namespace)
     finally:
-        with contextlib.suppress(BusError):  # a process that is stopped takes no leave; who asked need not wait for it
+        with contextlib.suppress(BusError):  # a process that is stopped takes no leave; the caller need not wait for it
             within(CLOSE_WITHIN, bus.close, "bus close")

@@ -142,7 +142,7 @@ def serve(pipe: Connection) -> None:
             answer = "given", found
         except OperatorFailure as error:
             answer = "failed", (error.when, error.summary)
-        except BaseException as error:  # whatever an operator raises is told, as in a run
+        except BaseException as error:  # whatever an operator raises is reported, as in a run
             answer = "raised", readable(error)
         pipe.send_bytes(pickle.dumps(answer, PROTOCOL))
     if here is not None:

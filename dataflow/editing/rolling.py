@@ -70,7 +70,7 @@ def keep_span(
 def _told(
     records: Mapping[str, Sequence[FiringRecord]], outputs: Mapping[str, Sequence[str]]
 ) -> dict[str, tuple[int, int]]:
-    """By stream, the last incarnation that records tell of, and the last stamp in it."""
+    """By stream, the last incarnation with records, and the last stamp in it."""
     told: dict[str, tuple[int, int]] = {}
     for operator, known in records.items():
         for record in known:

@@ -51,7 +51,7 @@ class LiveRunner(OperatorRunner):
     """One operator in a live run. It outlives its failures as its restart policy allows.
 
     A failed operator is restarted after the back-off and goes on with what is then in its queues; its streams begin a
-    new incarnation. `on_failure` is told of every failure that is outlived.
+    new incarnation. `on_failure` is called for every failure that is outlived.
     """
 
     keeps_time = True
@@ -99,7 +99,7 @@ class LiveRunner(OperatorRunner):
         self._code = code_now(type(self.operator))
         """The code that it runs: a reload of another operator of the process changes what is imported, and not this."""
         self._told = True
-        """True when the aligner may have something to decide: it was told something since it had not."""
+        """True when the aligner may have something to decide: it received something since it had not."""
 
     # Counts
 

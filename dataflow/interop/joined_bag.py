@@ -154,7 +154,7 @@ class SalvagedBag(JoinedBag[IntactFile | DamagedFile]):
         return file.topics()
 
     def _salvaged(self, file: Path, reason: str) -> tuple[DamagedFile, str, bool]:
-        """A broken file, record by record; what is told of it; whether anything is known to be missing.
+        """A broken file, record by record; the notes about it; whether anything is known to be missing.
 
         Raises `BagError` where nothing is left of it.
         """

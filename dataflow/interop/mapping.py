@@ -28,7 +28,7 @@ _SAME = {
     "extrinsics": "static",
 }
 _PLAIN = {"raw", "data", "msg", "robot", "sensor"}
-"""Words that tell nothing."""
+"""Words without information."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ class BagStreams:
     """Some topics of a bag as the streams that they stand in for (`PlayableStreams`).
 
     One pass over the bag, when it is opened, finds the times of all messages; nothing is kept of them but those.
-    `watch` is told the number of messages seen. Raises `BagError`, `RecordingError`.
+    `watch` is given the number of messages seen. Raises `BagError`, `RecordingError`.
     """
 
     metadata: Mapping[str, Mapping[str, str]] = {}

@@ -164,7 +164,7 @@ class Pipe:
 
     @property
     def silence(self) -> float:
-        """Seconds since the other end was heard."""
+        """Seconds since the other end last sent anything."""
         return time.monotonic() - self._heard_at
 
     @property

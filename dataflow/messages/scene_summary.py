@@ -1,4 +1,4 @@
-"""Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words.
+"""Scene graphs for people: of hundreds of relations the few that matter, as data and in words.
 
 The kind of a node follows from ids, relations and activities, not from names of classes: ids up to 0 are places (room,
 floor, walls, table tops) and the robot itself, as SceneGraphBuilder numbers them; agents are the nodes that act.
@@ -35,7 +35,7 @@ ROOMS = -1_000_000
 """Ids below this are rooms."""
 
 LEAST = 0.5
-"""Score from which a relation is told; of an intention any."""
+"""Score from which a relation is shown; of an intention any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class SummaryRelation:
 
 @dataclass(frozen=True, slots=True)
 class SceneSummary:
-    """The relations of a graph that are worth telling.
+    """The relations of a graph that are worth showing.
 
     - `carriers`: by node, what it stands on, lies in or sits on: one relation at most, without loops.
     - `children`: by node, the nodes that it carries.
@@ -58,7 +58,7 @@ class SceneSummary:
     - `intentions`: where agents may be going, likeliest first.
     - `agents`: the nodes that have an activity or are the subject of an `ACTING` predicate.
     - `places`: the nodes that others are in, or that only part them: room, floor, walls; not a top that carries things.
-    - `tops`: surfaces that are part of a thing, which is told in their place.
+    - `tops`: surfaces that are part of a thing, which is shown in their place.
     - `rooms`: by node of a room where there are several, the nodes that are in it.
     """
 
@@ -82,7 +82,7 @@ def class_names(graph: SceneGraph) -> tuple[str, ...]:
 
 
 def summarize(graph: SceneGraph, activities: Activity | None = None, most: int = 24) -> SceneSummary:
-    """Chooses what to tell of a graph: who carries what, intentions, and at most `most` other relations.
+    """Chooses what to show of a graph: what carries what, intentions, and at most `most` other relations.
 
     `SURROUNDINGS` are left out, then the commonest predicates until few enough are left; an agent has its strongest
     relation of each kind (it faces one thing, not five).

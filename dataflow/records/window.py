@@ -38,7 +38,7 @@ def records_from(
     """Reads the records that repeating all operators from `stamp` (ns) on needs, up to about `end` (ns), or all of them
     where that is not known.
 
-    It is known of recordings whose events tell of what happens to operators besides firings, if nothing did before. Of
+    It is known of recordings whose events cover what happens to operators besides firings, if nothing did before. Of
     an operator with a state it takes one recorded at or before `stamp`. `makers`: the nodes of the graph, of which the
     `stateless` and the `stateful` ones may be repeated. `reach`: the span (ns) before `stamp` in which they are looked
     for at first, by default `FIRST_REACH`. Raises `RecordingError`.

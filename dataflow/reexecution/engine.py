@@ -112,7 +112,7 @@ class Recomputation:
         make_effects: bool = False,
         in_turn: Collection[str] = (),
     ) -> None:
-        self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
+        self._driver = Driver(in_order=True)  # writers into a message come before readers whose digests show it
         nodes = [graph.nodes[name] for name in feeding.operators]
         records = {n.name: partial(_until, partial(log.ordered, n), slices.get(n.name, (None, end))[1]) for n in nodes}
         outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)

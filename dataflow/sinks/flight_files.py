@@ -54,7 +54,7 @@ class FlightFiles:
         self._asked.put(partial(self._forget, segment))
 
     def join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
-        """Cuts a span out of some files into a recording; `one` is told how large it is, or what went wrong."""
+        """Cuts a span out of some files into a recording; `one` is given its size, or what went wrong."""
         self._asked.put(partial(self._join, segments, part, out, one))
 
     def finish(self) -> None:

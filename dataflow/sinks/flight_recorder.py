@@ -73,7 +73,7 @@ class FlightSink(StreamSink):
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
         self._recorded: dict[str, int] = {}
-        """The last stamp of which each operator's firing records tell."""
+        """The last stamp in each operator's firing records."""
         self._forgotten = False
         self._work = FlightFiles(graph, self._storage.mode)
         self._segments: deque[Segment] = deque()

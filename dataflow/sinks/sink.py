@@ -263,7 +263,7 @@ class SinkProcess:
     def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
         match kind:
             case "poll":
-                self._report(time.monotonic())  # what is owed comes first: idle is who owes nothing
+                self._report(time.monotonic())  # what is owed comes first: idle means owing nothing
                 self.channel.send(
                     "state",
                     round=fields["round"],

@@ -64,8 +64,8 @@ class Agent:
     def __init__(
         self, name: str, endpoint: str, keys: Path | None, folder: Path, notice: Callable[[str], None], patience: float
     ) -> None:
-        """`patience`: the seconds for which operators go on without the supervisor being heard. `notice` shows a line
-        to who has started the agent."""
+        """`patience`: the seconds for which operators go on without a sign of life from the supervisor. `notice`
+        shows a line to the user who has started the agent."""
         self.name, self.patience, self.notice, self._endpoint = name, patience, notice, endpoint
         self.folder, self._keys = folder.absolute(), keys and keys.absolute()  # it changes into its folder
         self._id = secrets.token_bytes(8)

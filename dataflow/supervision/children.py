@@ -170,7 +170,7 @@ class Children:
             child.signal(number)
 
     def flush(self) -> None:
-        """Sends what processes take; who takes nothing is looked at again when it does."""
+        """Sends what processes take; one that takes nothing is looked at again when it does."""
         now = self._clock()
         for label, child in self._children.items():
             channel = child.channel

@@ -1,4 +1,4 @@
-"""The supervisor's end of the nursery: asks for processes and is told how they end. Nothing here waits, but `close`."""
+"""The supervisor's end of the nursery: requests processes and gets their exit codes. Nothing here waits but `close`."""
 
 from __future__ import annotations
 

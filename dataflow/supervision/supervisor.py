@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 TICK = 0.05
 PART_WITHIN = 4.0
-"""Seconds for which other machines are told that the run is over."""
+"""Seconds for which other machines are notified that the run is over."""
 PAUSE = 1.0
 """Seconds for which the supervisor did not run, at once, that are worth saying."""
 
@@ -122,7 +122,7 @@ class Supervisor:
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
             if LINK in self._endpoints:
-                stack.callback(self._part)  # machines that were shown what they need are told of any end
+                stack.callback(self._part)  # machines that were shown what they need are notified of any end
                 self._meet(pairs)
             over = self._loop()
         if over.failure is not None:

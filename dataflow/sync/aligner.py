@@ -52,7 +52,7 @@ class StreamEnd(NamedTuple):
 
 
 class Aligner:
-    """Decides one operator's firings. `push`, `advance` and `end` tell it what streams said; `poll` asks. One thread at
+    """Decides one operator's firings. `push`, `advance` and `end` take what streams carry; `poll` asks. One thread at
     a time. Frontiers and stamps are integer nanoseconds."""
 
     def __init__(self, spec: AlignSpec) -> None:

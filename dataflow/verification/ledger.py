@@ -1,4 +1,4 @@
-"""The books of a recording: the messages that its nodes made against the firing records that tell of them.
+"""The accounts of a recording: the messages that its nodes made against their firing records.
 
 A message without a record shows that records were lost, however whole the others look. Where a recording ends before
 its run did (its writer was killed, the run failed), that is a *cut*: what lies after it cannot be verified.
@@ -75,10 +75,10 @@ def read_ledger(recording: Recording, graph: Graph, books: GraphRecordTotals, no
 def incomplete_streams(
     recording: Recording, graph: Graph, books: GraphRecordTotals, nodes: Iterable[str]
 ) -> frozenset[str]:
-    """The recorded streams of operators among `nodes` that lack messages their firing records tell of.
+    """The recorded streams of operators among `nodes` that lack messages that are in their firing records.
 
     A record is stored before its message, so a process that is killed leaves records of messages that went no further
-    than to its own operators. What took them can be repeated all the same: the records tell how to make them again.
+    than to its own operators. What took them can be repeated all the same: the records hold how to make them again.
     """
     return frozenset(
         stream

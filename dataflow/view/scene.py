@@ -79,7 +79,7 @@ class ViewOptions:
       fit); None: as float32. `depth_block`: side (pixels) of the squares that have one depth each; 1: every pixel.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log notes it once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
-    - `point_shades`: colours that the values of a cloud's points are told apart by, which packs better; 0: all.
+    - `point_shades`: colours that distinguish the values of a cloud's points, which packs better; 0: all.
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
       have had a point in a cell, so that what moves leaves none.
     - `trail`: trails get a vertex every so many metres at least.

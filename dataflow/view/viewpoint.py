@@ -36,7 +36,7 @@ class ViewerPose:
 
 @dataclass(slots=True)
 class Viewpoint:
-    """Frames, ranges and positions that messages have told of so far."""
+    """Frames, ranges and positions that messages have given so far."""
 
     optical: dict[str, None] = field(default_factory=dict)
     """Optical frames, in the order in which they came."""
@@ -59,7 +59,7 @@ class Viewpoint:
             self._ranges.append(float(np.median(d)))
 
     def saw_points(self, T: Vector | None, points: npt.ArrayLike) -> None:
-        """Points (N, 3) of a cloud in its sensor's frame tell how far things are; with the frame's pose `T` in the root
+        """Points (N, 3) of a cloud in its sensor's frame show how far things are; with the frame's pose `T` in the root
         frame, those of a scan all round also where the place is, and the newest what there is at the end."""
         p = np.asarray(points, np.float64).reshape(-1, 3)
         distances = np.linalg.norm(p, axis=1)

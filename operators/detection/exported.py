@@ -159,7 +159,7 @@ class ExportedFinder:
         if any(a.ndim == 0 or len(a) != count for a in answers[0]):
             shapes = ", ".join(str(a.shape) for a in answers[0])
             raise ModelError(
-                f"{self._file} was given {count} images and answered {shapes}, which cannot be told apart by image; "
+                f"{self._file} was given {count} images and answered {shapes}, which cannot be divided by image; "
                 f"export it for one image at a time"
             )
         return [[a[k : k + 1] for a in answers[0]] for k in range(count)]

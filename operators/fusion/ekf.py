@@ -333,7 +333,7 @@ class EkfFusion(Operator):
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
 
     def _late(self, sensor: str) -> int:
-        """Returns by how much (ns) a sensor's stamps are found to be late, without being told."""
+        """Returns by how much (ns) a sensor's stamps are found to be late, beyond their settings."""
         found = self._filter.suspicion
         if found is None or found[:2] != (sensor, LATE) or abs(found[2]) >= self.window:
             return 0

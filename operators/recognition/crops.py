@@ -36,7 +36,7 @@ class Subjects:
         return views(image, detections)
 
     def summary(self) -> dict[str, int]:
-        """Counts, for an operator's summary; empty where nothing is to be told."""
+        """Counts, for an operator's summary; empty where there is nothing to report."""
         return {"images_without_detections": self.missed} if self.missed else {}
 
 

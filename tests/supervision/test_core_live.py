@@ -251,7 +251,7 @@ DROPS = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {queue:
 
 
 def stopped_for_a_while(consumer: str) -> Play:
-    """A run in which the consumer `sum` was stopped at stamp 100, and is heard again at 900."""
+    """A run in which the consumer `sum` was stopped at stamp 100, and reports again at 900."""
     play = Play(LEFT, consumer, OTHER, live=True).starts()
     play.wait(0.1)
     play.tell(play.progress("left", {"left": 100}))
@@ -565,7 +565,7 @@ def test_processes_behind_a_link_that_is_down_are_neither_silent_nor_started_aga
     assert not any(isinstance(command, Signal) for command in play.commands)
     assert not play.core.status.restarts
     assert [note for note in play.core.status.notes if "link" in note] == [
-        "the link to machine 'robot' is down: nothing of that machine is heard, and its operators go on",
+        "the link to machine 'robot' is down: that machine does not answer, and its operators go on",
         "the link to machine 'robot' is back",
     ]
     play.beating = False

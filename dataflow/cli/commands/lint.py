@@ -37,7 +37,7 @@ def lint(
 
     Gaps, timestamps that repeat or go back, rates, streams that begin late or end early, frames that hang on nothing or
     have two parents. Clocks: gyroscopes, wheels, odometry, poses and images all show how the robot turns; where their
-    timestamps do not fit, the offset is told with its sign (+: the timestamps are late) and how it drifts. The clock
+    timestamps do not fit, the offset is reported with its sign (+: the timestamps are late) and its drift. The clock
     that most streams have is taken for right, unless the contract names one.
 
     Exit codes:

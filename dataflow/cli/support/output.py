@@ -166,7 +166,7 @@ _KNOWN = {
     *("MappingError", "MessageError", "InvalidName", "NetworkError", "NotRunning", "OperatorImportError"),
     *("ParameterError", "RecordingError", "RegistryError", "ReplayError", "SweepError", "ViewerError", "WrongCommand"),
 }
-"""Errors of this package whose messages tell users what they can do."""
+"""Errors of this package whose messages name the remedy."""
 
 
 def _explained(error: Exception) -> tuple[str, str, int] | None:

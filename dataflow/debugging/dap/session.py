@@ -215,7 +215,7 @@ class Session:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
         assert self._away is not None
         here, away, self._away = self._going.call, self._away, None
-        self._raises = -1  # who comes to that line anew is stopped at it anew
+        self._raises = -1  # a call that reaches that line anew stops anew
         try:
             return away()
         except Abandoned:

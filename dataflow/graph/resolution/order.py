@@ -1,4 +1,4 @@
-"""The graph as a whole: cycles that would wait for themselves, the order of operators, who is fed by devices."""
+"""The graph as a whole: cycles that would wait for themselves, the order of operators, which are fed by devices."""
 
 from __future__ import annotations
 

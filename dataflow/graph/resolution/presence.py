@@ -135,7 +135,7 @@ class Presence:
                 draft.inputs[name] = list(patterns)
 
     def _allowed(self, choice: Choice, who: str, what: str, place: Place) -> bool:
-        """Reports a choice of which nothing is there, though who names it is not inside the graph that lacks it."""
+        """Reports a choice of which nothing is there, though it is not named inside the graph that lacks it."""
         reasons = () if self.found(choice) else self.why(choice)
         if not reasons or _known(who, reasons):
             return True

@@ -35,7 +35,7 @@ class LosslessPolicy:
 
 
 class LossReportingPolicy(LosslessPolicy):
-    """A live run goes on: the supervisor is told, and what does not fit is refused and counted."""
+    """A live run goes on: the supervisor is notified, and what does not fit is refused and counted."""
 
     def __init__(self, label: str, channel: Channel) -> None:
         super().__init__(label)

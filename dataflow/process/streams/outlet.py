@@ -133,7 +133,7 @@ class Outlet:
                     link.send(channel, parts, parts_size(parts))
 
     def push(self) -> None:
-        """Sends what has waited for room, as far as there is some, and static messages to who was started again."""
+        """Sends what has waited for room, as far as there is some, and static messages to restarted processes."""
         if self._fanout.quiet():
             return
         for keys, link in self._fanout.joined():
@@ -194,7 +194,7 @@ class Outlet:
         self.sent += self._fanout.send(stream, parts, envelope, droppable=droppable)
 
     def _send_records(self, operator: str, batch: bytes) -> None:
-        """Sends firing records, to the recorder and to who subscribes to them from outside."""
+        """Sends firing records, to the recorder and to subscribers from outside."""
         self._send_bytes(firings_key(self._namespace, operator), batch)
 
     def _send_bytes(self, key: str, batch: bytes) -> None:
@@ -272,7 +272,7 @@ class Outlet:
             self._note_last()
 
     def _note_last(self) -> None:
-        """Gives the last record to the recorder's batch, and to those who ask for latencies."""
+        """Gives the last record to the recorder's batch, and to requests for latencies."""
         record, self._unnoted = self._unnoted, None
         if record is None:
             return

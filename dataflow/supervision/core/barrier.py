@@ -39,7 +39,7 @@ class Barrier:
             status.first = first if status.first is None else min(first, status.first)
         if steps is not None:
             status.steps = max(steps, status.steps or 0)
-        if self.run.release is None:  # others may be sending probes already, so it may see one before it is told to
+        if self.run.release is None:  # others may be sending probes already, so it may see one before it is asked to
             process.unseen = self.run.takes(process)
 
     def tick(self) -> bool:
@@ -110,7 +110,7 @@ def expect_probes(run: RunState, process: Supervised) -> None:
 
 
 def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
-    """Notifies the consumers of a process that it is away, or that it is to be heard again."""
+    """Notifies the consumers of a process that it is away, or that it is back."""
     made = set(process.plan.publish)
     for other in run.processes.values():
         taken = made & run.takes(other)

@@ -1,7 +1,7 @@
 """The end of a run: first the processes with operators leave, then the recorder and the like, then none is left.
 
 A run that is stopped while it starts has nothing to drain: a process that is still starting is killed soon, which is
-no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run
+no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is notified how the run
 ended only when nothing can go wrong with the others any more. Every step is bounded; a process that is late is killed.
 """
 
@@ -18,7 +18,7 @@ from dataflow.supervision.core.supervised import Supervised
 LEAVE_TIMEOUT = 10.0
 LEAVE_AT_ONCE = 1.0
 DIE_WITHIN = 1.0
-"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is told to leave."""
+"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is asked to leave."""
 CLOSE_TIMEOUT = 60.0
 """Seconds for `close()` of every operator, at the orderly end of a run; a shorter `stall_timeout` shortens it."""
 SHORTEST = 5.0

@@ -125,7 +125,7 @@ class Core:
             self._close(None)
 
     def _see_to_death(self, process: Supervised) -> None:
-        """A process that closed its channel, or failed and was told to leave, has so much time to end."""
+        """A process that closed its channel, or failed and was asked to leave, has so much time to end."""
         now = self.run.steady
         if process.hung_up is not None and now - process.hung_up > LEAVE_TIMEOUT:
             self.run.kill(process, process.cause or "closed its channel and did not end")
@@ -188,7 +188,7 @@ class Core:
             part.said(process, kind, fields)
 
     def _failed(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be told to
+        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be asked to
         leave."""
         if process.life in (Life.KILLED, Life.FAILED):
             return  # its end is decided

@@ -42,7 +42,7 @@ _THIN = 0.05  # metres: least radius of a capsule
 
 @visualizer(SceneGraph, "graph", "space", "text")
 def scene_graph(canvas: Canvas, message: SceneGraph) -> None:
-    """Objects in space, a tree and a list of those relations that are worth telling."""
+    """Objects in space, a tree and a list of those relations that are worth showing."""
     activities = canvas.scene.remembered.get((_operator(canvas.stream), "activities"))
     told = summarize(message, activities)
     tree(canvas, message, told, activities)
@@ -159,7 +159,7 @@ def _agents(canvas: Canvas, message: SceneGraph, agents: Sequence[int], activiti
 
 
 def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: set[int]) -> None:
-    """Thin lines from each thing to what carries it, thicker ones with words for what else is told."""
+    """Thin lines from each thing to what carries it, thicker ones with words for other relations."""
     carried = [r for r in told.carriers.values() if r.object not in told.places and {r.subject, r.object} <= drawable]
     ends = [message.positions[[r.subject, r.object]] for r in carried]
     if _moved(canvas, "carried", ends):

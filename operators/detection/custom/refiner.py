@@ -36,9 +36,9 @@ class RefinerSettings:
 
 class Refiner:
     """A small network that sees the close-up of each box in the image's full resolution, and what the detector's inner
-    maps tell of its surroundings.
+    maps show of its surroundings.
 
-    It moves the four sides; scores stay. One network for all classes, which is told the class. Method: Cai and
+    It moves the four sides; scores stay. One network for all classes, with the class as input. Method: Cai and
     Vasconcelos, "Cascade R-CNN", 2018: a second regression, from the boxes of the first.
     """
 

@@ -50,7 +50,7 @@ class RefinerNetwork(nn.Module):
     """Close-ups (N, S, S, 3) uint8, surroundings (N, A) and places (N, F) → sides (N, 4), shares of the window.
 
     Every side is seen as if it were the left one: the half of the close-up beside it, fine across the side and coarse
-    along it, and the whole, coarse. So one set of weights learns from all four sides. The surroundings tell them apart.
+    along it, and the whole, coarse. So one set of weights learns from all four sides. The surroundings differ.
     """
 
     def __init__(self, classes: int, side: int, around: int) -> None:

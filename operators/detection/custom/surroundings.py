@@ -1,4 +1,4 @@
-"""Samples of a detector's own inner maps on a grid over the window of a box: they tell of its surroundings."""
+"""Samples of a detector's own inner maps on a grid over the window of a box: they describe its surroundings."""
 
 from __future__ import annotations
 

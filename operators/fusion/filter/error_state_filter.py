@@ -131,20 +131,20 @@ class ErrorStateFilter(Remembered):
 
     @property
     def hypotheses(self) -> int:
-        """Returns how many headings are in question: one where it was told, until that is refuted."""
+        """Returns how many headings are in question: one where it was given, until that is refuted."""
         node = self._newest()
         told = any(h.against for h in node.hypotheses) and not node.refuted
         return 1 if told else len(likely(node.hypotheses))
 
     @property
     def doubted_heading(self) -> bool:
-        """Returns whether what was told of the first heading may be wrong, though it is not refuted."""
+        """Returns whether the given first heading may be wrong, though it is not refuted."""
         node = self._newest()
         return node.doubted and not node.refuted
 
     @property
     def refuted_heading(self) -> bool:
-        """Returns whether what was measured contradicts what was told of the first heading, of late."""
+        """Returns whether recent measurements contradict the given first heading."""
         node = self._newest()
         return node.refuted and node.moving < _STANDS
 
@@ -299,7 +299,7 @@ class ErrorStateFilter(Remembered):
         return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel, moving=moving, window=window)
 
     def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
-        """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
+        """Goes on at the same velocities, or those that were commanded: what is felt is gravity alone."""
         steps = max(1, math.ceil(seconds / 0.05))
         turning = gyro if self._config.inertial else np.zeros(3)
         for k in range(steps):

@@ -111,7 +111,7 @@ class Suspicions(Remembered):
     def look(self, time: int, window: Window, sure: bool = True) -> Fit | None:
         """Looks, once a second; returns the motion of late, None if it was not fitted or if speeds are wrong.
 
-        `sure`: nothing contradicts what was told of the first heading.
+        `sure`: nothing contradicts the given first heading.
         """
         if time - self._looked < _EVERY:
             return None
@@ -147,7 +147,7 @@ class Suspicions(Remembered):
         return sorted(every - estimated)
 
     def _judged(self, without: Fit, erring: Fit, enough: float) -> tuple[str, str, float, float] | None:
-        noise = max(erring.cost / erring.freedom, 1.0)  # what was told of it may be too small
+        noise = max(erring.cost / erring.freedom, 1.0)  # the given noise may be too small
         if without.cost - erring.cost < enough * noise or not erring.explains:
             return None
         k = int(np.argmax(np.abs(erring.errors) / erring.sigmas))

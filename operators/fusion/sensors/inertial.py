@@ -58,9 +58,9 @@ class InertialSensor(Remembered):
     def sample(self, name: str, imu: Imu, time: int) -> Sample:
         """Returns the sample of a message that was measured at a time (ns).
 
-        Raises UnusableMessage for readings that are not finite or all zero (a sensor that is off: at rest there is gravity, in
-        free fall there is noise), and for a sample not later than the last, ValueError where
-        the noise of the samples is unspecified.
+        Raises UnusableMessage for readings that are not finite or all zero (a sensor that is off: at rest there is
+        gravity, in free fall there is noise), and for a sample not later than the last, ValueError where the noise of
+        the samples is unspecified.
         """
         if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
             raise UnusableMessage("not finite")

@@ -159,7 +159,7 @@ def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array,
 
 
 def turning(message: Message, before: Message | None, around: MeasurementContext) -> Array | None:
-    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they tell."""
+    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they hold it."""
     if not isinstance(message, Odometry | Twist):
         return None
     try:

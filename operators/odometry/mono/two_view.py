@@ -1,6 +1,6 @@
 """Two views of an unknown scene: the motion that explains how corners went from one to the other, and their points.
 
-An essential matrix and a homography compete, and what neither can tell is named instead of guessed: a camera that has
+An essential matrix and a homography compete, and what neither can determine is named, not guessed: a camera that has
 only turned, a view that hardly changed, a plane that allows two motions. Mur-Artal et al., "ORB-SLAM", 2015, IV.
 """
 

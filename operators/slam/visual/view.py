@@ -28,7 +28,7 @@ from operators.slam.visual.place_index import rooted
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
-# Working pixels. Tracks that miss by more tell of colour and depth that are not of one place and time, and then every
+# Working pixels. Tracks that miss by more show colour and depth that are not of one place and time, and then every
 # sight errs anew: its variance grows with the fourth power of it.
 ASTRAY = 0.45
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
@@ -183,7 +183,7 @@ def _solved(known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -
 def _still(sighting: Sighting, known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -> Sighting:
     """Returns a sighting without the features of a body that has moved between the views, if depths show one.
 
-    Pixels alone hardly tell a step aside with a turn from a robot before a wall that has moved.
+    Pixels alone hardly distinguish a step aside with a turn from a robot before a wall that has moved.
     """
     steady = known.steady[pairs[:, 0]] & seen.steady[pairs[:, 1]]
     points, sure = seen.points[pairs[steady, 1]].astype(np.float64), part(sighting, steady)

@@ -17,7 +17,7 @@ from dataflow.sync import FOREVER, NEVER
 
 
 class FlowControl(Watcher):
-    """Takes in how far each process is, and recomputes what sources are told when that changes."""
+    """Takes in how far each process is, and recomputes what is sent to sources when that changes."""
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind == "progress":

@@ -1,7 +1,7 @@
 """The watch over single processes of a live run: their signs of life, deadlines, memory, and hanging calls.
 
 Who breaks a rule is killed, and started again by its restart policy. Without a policy a process that gives no sign of
-life is no longer waited for: the graph goes on without it until it is heard again.
+life is no longer waited for: the graph goes on without it until it reports again.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Heartbeats(Watcher):
         process.work = None if fields["work"] is None else tuple(fields["work"])
         if process.silent:
             process.silent = False
-            self.run.event("heard", f"{process.describe()} is heard again", operators=list(process.nodes))
+            self.run.event("heard", f"{process.describe()} reports again", operators=list(process.nodes))
             self._cover.heard_again(process)
         self._check_memory(process, fields["memory"])
 

@@ -1,4 +1,4 @@
-"""The watch over runs in which nothing happens: who holds them up is named, and the run ends."""
+"""The watch over runs in which nothing happens: what holds them up is named, and the run ends."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class StallWatch(Watcher):
             raise RunFailed(f"{process.describe()} has read nothing for {seconds:.0f} s", words)
 
     def _stuck(self, seconds: float) -> list[Supervised]:
-        """Returns those who hold up the run for so long: who does not answer, else who has not ended."""
+        """Returns those that hold up the run for so long: which do not answer, else which have not ended."""
         if self.run.steady - self._heard <= seconds:
             return []
         return self.quiescence.unanswered() or [p for p in self.run.working() if p.report is None]
@@ -111,7 +111,7 @@ class LiveStallWatch(StallWatch):
             self._flowing.discard(fields["stream"])
 
     def _stuck(self, seconds: float) -> list[Supervised]:
-        """Returns those who are at one call for so long."""
+        """Returns those that are at one call for so long."""
         return [p for p in self.run.working() if p.work is not None and p.work[2] >= seconds]
 
     def _stuck_since(self, process: Supervised) -> object:

@@ -1,4 +1,4 @@
-"""A part of the supervisor's core: it is told what happens, and acts through the run's state."""
+"""A part of the supervisor's core: it is notified of what happens, and acts through the run's state."""
 
 from __future__ import annotations
 
