@@ -59,7 +59,7 @@ class CapturedCall(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class OperatorSettings:
     """The operator: its name and class (`module:Class`), parameters, seed of the graph, version of the seeding,
     threads of libraries, output ports, environment (`env:`)."""
 
@@ -103,7 +103,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Captured:
+class CapturedCalls:
     """Calls of one operator; the last one is that in which something is wrong. They begin with the `state`, if there is
     one, and the parameters that had been changed by then: before the last `setup()`, and `since`.
 
@@ -112,7 +112,7 @@ class Captured:
     that it raises nothing.
     """
 
-    setting: Setting
+    setting: OperatorSettings
     at_setup: Mapping[str, Any]
     since: Mapping[str, Any]
     state: bytes | None
@@ -212,7 +212,7 @@ class Captured:
         return zlib.compress(pack_state(content), 6)
 
     @staticmethod
-    def from_bytes(data: bytes) -> Captured:
+    def from_bytes(data: bytes) -> CapturedCalls:
         """Reads what `to_bytes` gave. Raises ValueError for anything else."""
         try:
             content = unpack_state(zlib.decompress(data))
@@ -220,11 +220,11 @@ class Captured:
             raise ValueError(f"no captured call: {error}") from error
         if content["format"] != FORMAT:
             raise ValueError(f"a captured call of format {content['format']!r}; this version reads {FORMAT}")
-        setting = Setting(**content["setting"])
+        setting = OperatorSettings(**content["setting"])
         import_module(setting.use.partition(":")[0])  # declares its types of messages
         messages = {key: typed(Message, value) for key, value in content["messages"].items()}
         expected = content["expected"]
-        return Captured(
+        return CapturedCalls(
             setting,
             content["at_setup"],
             content["since"],
@@ -264,7 +264,7 @@ def check(path: Path) -> None:
 
     Raises `AssertionError`, or what the operator raises, where it is wrong still, and `EnvError`.
     """
-    captured = Captured.from_bytes(path.read_bytes())
+    captured = CapturedCalls.from_bytes(path.read_bytes())
     env, threads = captured.setting.env, captured.setting.threads
     if env is None or is_environment(env):
         captured.check()

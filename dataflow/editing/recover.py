@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.editing.part import copy_messages, graph_of, outputs_of
-from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.report import Watch, WrittenFile, unwatched
 from dataflow.recording import Recording
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import DIGESTS, RECOVERED, Kind
@@ -35,13 +35,13 @@ class LostMessages:
 
 
 @dataclass(slots=True)
-class Recovered:
+class RecoveryReport:
     """Summarises what was saved into a file, and what is lost.
 
     `torn`: the broken file had no proper end; `lost_bytes`: of the unfinished record there. `damage`: for people.
     """
 
-    saved: Edited
+    saved: WrittenFile
     torn: bool
     lost_bytes: int
     damage: list[str] = field(default_factory=list)
@@ -66,7 +66,7 @@ class Recovered:
 
 def recover(
     path: Path, out: Path, *, compression: Compression = "zstd", overwrite: bool = False, watch: Watch = unwatched
-) -> Recovered:
+) -> RecoveryReport:
     """Writes everything that can be read of `path` into a file with a proper end and an index.
 
     Chunks that fail their checksum are left out. Raises `RecordingError` for what is no MCAP file at all.
@@ -88,10 +88,10 @@ def recover(
                 copy.writer.add_metadata(RECOVERED, told)
             copy.attachments(origin)
             copy_messages(copy, origin, kept, watch)
-        saved = Edited(str(out), {n: k for n, k in sorted(origin.counts(kept).items()) if k}, out.stat().st_size)
+        saved = WrittenFile(str(out), {n: k for n, k in sorted(origin.counts(kept).items()) if k}, out.stat().st_size)
         saved.attachments = len(attached)
         lost = list(_by_numbers(origin, kept, out) if origin.own else _by_index(origin, kept))
-        return Recovered(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
+        return RecoveryReport(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
 
 
 def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[LostMessages]:

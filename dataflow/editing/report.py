@@ -18,7 +18,7 @@ def unwatched(done: int, total: int) -> None:
 
 
 @dataclass(slots=True)
-class Edited:
+class WrittenFile:
     """One file that was written.
 
     `streams`: messages by stream; `span`: first and last stamp of what is not static (ns). `beyond`: messages outside

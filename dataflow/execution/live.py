@@ -30,7 +30,7 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
-from dataflow.graph.code import ReloadError, Replaced, code_now
+from dataflow.graph.code import ReloadedCode, ReloadError, code_now
 from dataflow.graph.model import Node, OperatorImportError
 from dataflow.operator import Operator, OperatorSpec
 from dataflow.records.firing import MAX_STATE_BYTES
@@ -281,7 +281,7 @@ class LiveRunner(OperatorRunner):
         try:
             state = None if failed else self.calls.snapshot((self.records.incarnation, stamp))
             with interrupted_after(SET_UP_WITHIN):
-                code = Replaced(self.node, self._code)
+                code = ReloadedCode(self.node, self._code)
         except (OperatorFailure, OperatorImportError) as error:
             raise ReloadError(str(error)) from error
         try:

@@ -12,7 +12,7 @@ from dataflow.interop.clocks import Choice
 from dataflow.interop.conversions import offers, proposed
 from dataflow.interop.mapping import AvailableTopic, MappingError, Proposal, SourceStream, parse_map, propose
 from dataflow.interop.opening import open_bag
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.streams import BagStreams, MappedTopic
 from dataflow.interop.topics import Reading, is_known
 from dataflow.messages import CompressedDepth, DepthImage, Image, Image16, Message, Transforms
 from dataflow.messages.depth_units import MILLIMETRES
@@ -27,11 +27,11 @@ class Matching:
     readings: tuple[Reading, ...]
     proposal: Proposal
 
-    def played(self) -> dict[str, Played]:
+    def played(self) -> dict[str, MappedTopic]:
         """Stream → what stands in for it. Raises `MappingError` where the proposal is not settled."""
         if not self.proposal.settled:
             raise MappingError(self.explanation())
-        return {m.wanted.stream: Played(m.topic, m.type, m.wanted.static) for m in self.proposal.matches}
+        return {m.wanted.stream: MappedTopic(m.topic, m.type, m.wanted.static) for m in self.proposal.matches}
 
     def options(self) -> list[str]:
         """The proposal as words of `--map`."""
@@ -133,7 +133,7 @@ def readable(
     readings = readings_of(bag, topics)
     found = [r for r in readings if r.playable and r.topic.count]
     played = {
-        r.topic.name: Played(
+        r.topic.name: MappedTopic(
             r.topic.name,
             _wished(r, wishes).SCHEMA,
             r.read_as is Transforms and is_static(r.topic.name),

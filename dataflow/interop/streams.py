@@ -17,7 +17,7 @@ from dataflow.interop.bag import Bag, BagError, DamageReport, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.opening import open_bag
-from dataflow.interop.ranking import Found, Ranking, within
+from dataflow.interop.ranking import Ranking, TopicEntries, within
 from dataflow.interop.topics import Reading
 from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
@@ -30,7 +30,7 @@ MAX_HELD = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class MappedTopic:
     """A topic that stands in for a stream: as which message type, and whether as one message, valid always.
 
     `depth_scale`: how many units of 16-bit depth a metre has (REP 118: millimetres).
@@ -54,7 +54,7 @@ class BagStreams:
     def __init__(
         self,
         path: Path,
-        played: Mapping[str, Played],
+        played: Mapping[str, MappedTopic],
         clock: Choice = "auto",
         *,
         watch: Callable[[int], None] | None = None,
@@ -175,7 +175,7 @@ class BagStreams:
 
     # ------------------------------------------------------------------------------------------------- opening
 
-    def _reading(self, played: Played) -> Reading:
+    def _reading(self, played: MappedTopic) -> Reading:
         topic = self._bag.topics.get(played.topic)
         if topic is None:
             raise BagError(f"{self.path} has no topic {played.topic!r}; it has {', '.join(self._bag.topics) or 'none'}")
@@ -191,8 +191,8 @@ class BagStreams:
             )
         return reading
 
-    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, Found]:
-        found = {topic: Found() for topic in self._moving}
+    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, TopicEntries]:
+        found = {topic: TopicEntries() for topic in self._moving}
         for seen, stored in enumerate(self._bag.messages(self._moving), 1):
             try:
                 stamps = self._readers[stored.topic].stamps(stored.data)
@@ -303,7 +303,7 @@ class BagStreams:
             if (span := DepthSpan.of(np.concatenate(depths), 1.0)) and (doubt := span.doubt()):
                 self.account.doubted[topic] = f"{doubt}: --depth {topic}=UNITS sets the units of a metre"
 
-    def _read(self, played: Played, stored: Stored, stamp: int, part: int | None = None) -> list[Message]:
+    def _read(self, played: MappedTopic, stored: Stored, stamp: int, part: int | None = None) -> list[Message]:
         """A part of a message as the type that is played, or all of them; none where it cannot be read."""
         reader, wanted = self._readers[played.topic], message_type(played.type)
         losses: list[str] | None = [] if self._accounting else None
@@ -335,5 +335,5 @@ def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording
     """Opens a recording, or the bag that `opening` (`PlayableStreams.opening`) describes."""
     if opening is None:
         return Recording(path)
-    played = {stream: Played(*values) for stream, values in opening["played"].items()}
+    played = {stream: MappedTopic(*values) for stream, values in opening["played"].items()}
     return BagStreams(path, played, opening["clock"], strict=opening["strict"])

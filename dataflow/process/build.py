@@ -16,7 +16,7 @@ from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.reach import with_makers
-from dataflow.process.config import ProcessConfig, Resumed
+from dataflow.process.config import ProcessConfig, ResumeState
 from dataflow.process.live_sources import LiveSources
 from dataflow.recording import Recording
 from dataflow.records.black_box import BlackBox, OperatorProgress
@@ -138,7 +138,7 @@ def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:
     return BlackBox(descriptor, ports, reached)
 
 
-def _resume(runner: Maker, resumed: Resumed) -> None:
+def _resume(runner: Maker, resumed: ResumeState) -> None:
     if resumed.incarnation:
         runner.resume(resumed.incarnation, resumed.last, resumed.changed)
 

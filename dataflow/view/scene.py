@@ -12,7 +12,7 @@ import rerun as rr
 from dataflow.messages.geometry import split_matrix
 from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
-from dataflow.view.frames import Attach, Change, Detach, FrameTree, Matrix, NewRoot, Rank
+from dataflow.view.frames import Attach, Change, Detach, FramePriority, FrameTree, Matrix, NewRoot
 from dataflow.view.layout import Layout, is_truth
 from dataflow.view.viewpoint import Vector, Viewpoint
 
@@ -36,7 +36,7 @@ class Placed:
     child: str
     T_parent_child: Matrix
     stream: str
-    rank: Rank
+    rank: FramePriority
     stamp: int
     static: bool
 
@@ -208,7 +208,7 @@ class SceneState:
     def _take_unshown(self, recording: rr.RecordingStream, child: str, stamp: int) -> None:
         offer = self.unshown.needed(self.tree, child, stamp)
         if offer is not None and (offer.stamp == stamp or self.tree.owner(child) is None):
-            rank = Rank.TREE if offer.rank is Rank.TREE else Rank.UNSHOWN
+            rank = FramePriority.TREE if offer.rank is FramePriority.TREE else FramePriority.UNSHOWN
             self._place(recording, replace(offer, rank=rank, stamp=stamp))
 
     def draw_frames(

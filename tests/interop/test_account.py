@@ -23,7 +23,7 @@ from dataflow.interop.export.ros2 import export_ros2
 from dataflow.interop.export.source import ExportSource
 from dataflow.interop.opening import open_bag
 from dataflow.interop.playing import BagReadOptions, readable
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.streams import BagStreams, MappedTopic
 from dataflow.messages import Image, Image16, Measurement, Number, PointCloud, RangeReading
 from dataflow.recording import Recording
 from dataflow.recording.layout import BAG
@@ -80,7 +80,7 @@ def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_pat
             data = ROS2.serialize_cdr(message, "sensor_msgs/msg/Imu")
             writer.write(connection, time, bytes(data)[: 6 if i == 2 else None])
 
-    with BagStreams(tmp_path / "bag", {"imu": Played("/imu", "Imu")}) as streams:
+    with BagStreams(tmp_path / "bag", {"imu": MappedTopic("/imu", "Imu")}) as streams:
         assert len(list(streams.messages())) == 5
         assert streams.account.unread["/imu"].count == 1
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from dataflow.view.frames import Rank
+from dataflow.view.frames import FramePriority
 from dataflow.view.viewpoint import ViewerPose
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
@@ -43,7 +43,7 @@ def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
     around, before = SceneState(), SceneState()
     for scene, points in ((around, room - [1, 0, 0]), (before, ahead)):
         scene.tree.place("world", "lidar", np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-                         owner="r/base", rank=Rank.TREE, stamp=0)  # fmt: skip
+                         owner="r/base", rank=FramePriority.TREE, stamp=0)  # fmt: skip
         scene.viewpoint.saw_points(scene.tree.pose("lidar"), points)
 
     looked = around.viewpoint.outlook(around.tree)
@@ -63,7 +63,7 @@ def test_the_whole_way_of_a_run_without_ranges_is_in_view_when_it_is_over() -> N
     for x in np.linspace(0, 40, 5000):
         scene.viewpoint.saw_places(away, [x, 4 * np.sin(x), 0])
     scene.viewpoint.posed.setdefault("base")
-    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=Rank.TREE, stamp=0)
+    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=FramePriority.TREE, stamp=0)
     assert scene.viewpoint.knows_more
 
     begun = scene.viewpoint.outlook(scene.tree)
@@ -83,7 +83,7 @@ def test_what_a_camera_sees_at_the_end_is_in_view_with_its_way(far: float) -> No
     ahead = np.stack(np.meshgrid([2.0 * far, 3.0 * far], np.linspace(-far, far, 9), np.linspace(-0.3, far, 9)), -1)
     for x in np.linspace(0, 3, 40):
         shift[0, 3] = x
-        scene.tree.place("world", "camera", shift, owner="r/camera", rank=Rank.TREE, stamp=round(1e9 * x))
+        scene.tree.place("world", "camera", shift, owner="r/camera", rank=FramePriority.TREE, stamp=round(1e9 * x))
         scene.viewpoint.saw_places(np.eye(4), [x, 0, 0])
         scene.viewpoint.saw_points(scene.tree.pose("camera"), ahead.reshape(-1, 3))
     scene.viewpoint.posed.setdefault("camera")

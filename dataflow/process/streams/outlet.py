@@ -15,7 +15,7 @@ from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import Channel
-from dataflow.process.config import Resumed
+from dataflow.process.config import ResumeState
 from dataflow.process.streams.recent import RecentFirings
 from dataflow.process.streams.stream_order import Place
 from dataflow.records.black_box import BlackBox
@@ -321,12 +321,12 @@ class Outlet:
             self._network.bus.session.put(stream, payload)
 
 
-def incarnations_of(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
+def incarnations_of(resumed: Mapping[str, ResumeState], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
     """The incarnations that streams begin with, by stream; `outputs`: by operator, its ports and their streams."""
     return {stream: before.incarnation for operator, before in resumed.items() for stream in outputs[operator].values()}
 
 
-def left_by(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, Place]:
+def left_by(resumed: Mapping[str, ResumeState], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, Place]:
     """The places that streams had reached in the process before this one, by stream (`outputs` as above)."""
     return {
         outputs[operator][port]: (incarnation, number)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.decode import find_boxes
 from operators.detection.decode import Candidates
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.weights import NetworkFileError, open_network
 
 
@@ -22,7 +22,7 @@ class FirstStageDetections:
 
     found: Candidates
     inner: Sequence[NDArray[np.float32]]
-    fit: Fit
+    fit: ImageFit
 
 
 class FirstStage:
@@ -49,7 +49,7 @@ class FirstStage:
         Raises NetworkFileError where the network's output is not what its metadata say.
         """
         network = self.network
-        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), network.size)
+        fit = ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), network.size)
         outputs = network.run(fit.apply(pixels))
         levels = len(self._strides)
         try:

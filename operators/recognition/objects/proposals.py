@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.decode import decode_grid
 from operators.detection.nms import class_wise_nms
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.inference import open_session
 from operators.weights import NetworkFileError, open_network
 
@@ -34,7 +34,7 @@ class NetworkMaps:
 
     maps: Sequence[F32]
     trunk: Sequence[F32]
-    fit: Fit
+    fit: ImageFit
     more: Sequence[F32] = ()
 
 
@@ -59,7 +59,7 @@ class Trunk:
 
     def look(self, pixels: NDArray[np.uint8]) -> NetworkMaps:
         """Runs the network on an image (H, W, 3), RGB."""
-        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
+        fit = ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
         fitted = fit.apply(pixels)
         tensor = np.ascontiguousarray(fitted.transpose(2, 0, 1)[None], np.float32)
         tensor /= np.float32(255)

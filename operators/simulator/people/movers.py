@@ -88,7 +88,7 @@ class Driving:
         return CurrentActivity(thing, activity, t - (u - begin) % self._path.period, "drive a loop")
 
 
-class Carried:
+class CarriedObject:
     """A thing that lies still except while a person's hand has it: then it moves with the hand, upright."""
 
     def __init__(self, thing: int, T_rest: Array, person: Person, grasped_at: float) -> None:

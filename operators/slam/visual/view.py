@@ -84,7 +84,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ViewMatch:
     """Holds how a camera's view was measured against a known one, and what supports it.
 
     `inliers` features agree with the pose, of which `relief` lie off the plane that holds most of them; `overlap` is
@@ -114,7 +114,7 @@ class Judge:
     agreement: float = 0.8
     relief: int = 8
 
-    def doubt(self, sight: Sight) -> str:
+    def doubt(self, sight: ViewMatch) -> str:
         """Returns why a sight is not to be believed; nothing for one that is."""
         if sight.inliers < self.inliers:
             return "too few features agree"
@@ -125,7 +125,7 @@ class Judge:
         return ""
 
 
-def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> Sight | None:
+def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> ViewMatch | None:
     """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
 
     RANSAC PnP on matched descriptors; where few agree, on those matched where the map expects them, and once more where
@@ -147,7 +147,7 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matr
     if fit.inliers < fewest:
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
-    return Sight(
+    return ViewMatch(
         fit.T_world_camera, SURE * astray(fitter.noise) * fit.covariance, matched, fit.inliers,
         relief(sighting.points_world), overlap, fit.depth_inliers,
     )  # fmt: skip

@@ -24,7 +24,7 @@ from operators.detection.custom.refiner import Refiner, RefinerSettings, look_ag
 from operators.detection.custom.surroundings import GRID, surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.learning.augmentation import Variation
 from operators.training.options import ImageTraining
 from operators.training.refining import add_second
@@ -170,7 +170,7 @@ def test_boxes_that_are_astray_come_to_their_objects(refined: Refined) -> None:
 
 def looked_at(found: Candidates) -> FirstStageDetections:
     return FirstStageDetections(
-        found, [np.zeros((1, 4, 6, 10), np.float32)], Fit.plan("letterbox", (160, 96), (160, 96))
+        found, [np.zeros((1, 4, 6, 10), np.float32)], ImageFit.plan("letterbox", (160, 96), (160, 96))
     )
 
 
@@ -206,7 +206,7 @@ def test_only_the_best_boxes_are_looked_at_again_and_none_needs_none() -> None:
 
 def test_surroundings_are_samples_over_the_window() -> None:
     """Of a map whose value is its place: the samples lie on a grid over the window, whatever its size."""
-    fit = Fit.plan("letterbox", (320, 192), (160, 96))
+    fit = ImageFit.plan("letterbox", (320, 192), (160, 96))
     rows, columns = np.mgrid[:12, :20].astype(np.float32) + 0.5
     place = np.stack([columns * 8, rows * 8])[None]  # of each cell's middle, in the input
     shares = (np.arange(GRID) + 0.5) / GRID
@@ -229,7 +229,7 @@ def test_surroundings_of_any_window_lie_between_the_least_and_the_greatest_value
 ) -> None:
     seen = np.sort(np.array(corners, np.float32).reshape(-1, 2, 2), axis=1).reshape(-1, 4)
     map = np.random.default_rng(height * width).random((1, 3, height, width)).astype(np.float32)
-    found = surroundings([map], seen, Fit.plan("letterbox", (320, 192), (160, 96)))
+    found = surroundings([map], seen, ImageFit.plan("letterbox", (320, 192), (160, 96)))
     assert found.shape == (len(seen), GRID * GRID * 3)
     assert found.min() >= map.min() - 1e-5
     assert found.max() <= map.max() + 1e-5
@@ -237,7 +237,7 @@ def test_surroundings_of_any_window_lie_between_the_least_and_the_greatest_value
 
 def test_a_window_far_larger_than_a_small_map_has_samples_of_its_coarsest_cells() -> None:
     """A map of 6 cells is halved once, then too small: the largest window takes what the halved one has."""
-    map, fit = np.full((1, 2, 6, 6), 3.5, np.float32), Fit.plan("letterbox", (160, 96), (160, 96))
+    map, fit = np.full((1, 2, 6, 6), 3.5, np.float32), ImageFit.plan("letterbox", (160, 96), (160, 96))
     seen = np.array([[-3000, -3000, 3000, 3000]] * 50 + [[10, 10, 20, 20]], np.float32)
     assert (surroundings([map], seen, fit) == 3.5).all()
 

@@ -57,7 +57,7 @@ class LeftoverRecords(Watcher):
                 self.run.tell_recorder("records", batches=batches)
 
     def resumed(self, operator: str) -> dict[str, Any]:
-        """Returns what the next process of this operator begins with: fields of `Resumed`, as plain values."""
+        """Returns what the next process of this operator begins with: fields of `ResumeState`, as plain values."""
         reached = self._reached.get(operator, OperatorProgress())
         return {
             "incarnation": reached.incarnation + 1,
