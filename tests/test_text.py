@@ -23,7 +23,7 @@ from dataflow.text import visible, visible_json, visible_lines
         ("\ud800", "\\ud800"),
     ],
 )
-def test_what_a_terminal_would_obey_is_escaped(text: str, shown: str) -> None:
+def test_control_characters_are_escaped(text: str, shown: str) -> None:
     assert visible(text) == shown
 
 
@@ -36,7 +36,7 @@ def test_visible_text_is_one_line_and_stays_as_it_is(text: str) -> None:
 
 
 @given(st.text())
-def test_what_can_be_seen_is_left_as_it_is(text: str) -> None:
+def test_printable_text_is_unchanged(text: str) -> None:
     shown = visible_lines(text)
     assert visible_lines(shown) == shown
     assert shown.encode().decode() == shown

@@ -1,4 +1,4 @@
-"""The `dataflow` command. `commands.py` lists what it can do; each imports what it needs when it runs."""
+"""The `dataflow` command. `registry.py` lists what it can do; each imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.commands import completion
+from dataflow.cli.plugins import CommandGroup
 from dataflow.cli.support.options import option
 from dataflow.cli.support.output import (
     COULD_NOT_RUN,
@@ -21,7 +22,6 @@ from dataflow.cli.support.output import (
     interrupted_by_user,
     wants_traceback,
 )
-from dataflow.cli.support.plugins import CommandGroup
 from dataflow.cli.support.standard_output import OutputFailed
 from dataflow.extras import missing_extra
 

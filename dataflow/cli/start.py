@@ -11,6 +11,7 @@ import signal
 import sys
 from types import FrameType
 
+from dataflow.cli.support import command_line
 from dataflow.cli.support.standard_output import Output, OutputFailed
 
 COULD_NOT_RUN = 2
@@ -19,14 +20,9 @@ COLLECT_AFTER = 20_000
 """Objects made between two searches for garbage: modules make many that stay, and 700 would cost a tenth of a start."""
 
 
-words: list[str] | None = None
-"""The arguments of this process, where it is the command and no other program that calls commands."""
-
-
 def main() -> None:
     """Runs the command line of this process."""
-    global words
-    words = sys.argv[1:]
+    command_line.words = sys.argv[1:]
     interrupted = signal.getsignal(signal.SIGINT)
     if interrupted is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)  # while importing there is nothing to put in order

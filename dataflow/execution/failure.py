@@ -6,6 +6,8 @@ import traceback
 from pathlib import Path
 from types import TracebackType
 
+from dataflow.extras import INSTALL, missing_extra
+
 RAISED = BaseException
 """The errors that an operator may raise: it has no right to end its process, whatever it derives its errors from."""
 RESTORE = "restore()"
@@ -18,19 +20,22 @@ _ENGINE = Path(__file__).parent.parent
 class OperatorFailure(RuntimeError):
     """An operator raised or broke its contract.
 
-    Carries its name, the firing, the operator's own traceback ("" where the error's text is all there is to know), and
-    the file and line of its code that raised ("" and 0 where none did).
+    Carries its name, the firing, the error as it is recorded (`summary`) and with the extra that brings a missing
+    package (`told`), the operator's own traceback ("" where the error's text is all there is to know), and the file
+    and line of its code that raised ("" and 0 where none did).
     """
 
     def __init__(self, operator: str, when: str, error: BaseException) -> None:
         self.operator, self.when = operator, when
         self.summary = readable(error)
+        hint = "" if INSTALL in self.summary else missing_extra(error)
+        self.told = "; ".join(filter(None, (self.summary, hint)))
         self.file, self.line = place_of(error.__traceback__)
         if tells_all(error) and not self.file:
             self.traceback = ""
         else:
             self.traceback = _traceback(error, self.summary)
-        super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
+        super().__init__(f"operator {operator!r} failed in {when}: {self.told}")
 
     @property
     def where(self) -> str:

@@ -6,16 +6,19 @@ import errno
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from dataflow.graph.expansion.expand import Expander
 from dataflow.graph.model import Bundle, Graph
-from dataflow.graph.problems import Place, Problems
+from dataflow.graph.problems import GraphError, Place, Problems
 from dataflow.graph.resolution.presence import Presence
 from dataflow.graph.resolution.resolve import Resolver
 from dataflow.graph.search import add_folder
+from dataflow.graph.yaml import document
 from dataflow.graph.yaml.limits import MAX_BUNDLE, MAX_TEXT
+from dataflow.graph.yaml.tree import Table
 
 BUNDLE_FORMAT = "dataflow-graph/1"
 
@@ -77,6 +80,26 @@ def load_bundle(bundle: str) -> Graph:
         raise AssertionError from error
     read = partial(_from, packed.files)
     return _load(packed.file, read, packed.environment.get, lambda: packed.folder, packed.settings, str)
+
+
+def filled_by(graph: Graph, operator: str, name: str) -> str | None:
+    """The graph's own parameter that fills a text parameter of an operator: with another text, so has the operator.
+
+    None where there is none. Loads the graph anew for each parameter that it declares, from its bundle.
+    """
+    packed = graph.sources_bundle
+    root = document.parse(packed.files[packed.file], packed.file, Problems())
+    declared = root.get("params") if isinstance(root, Table) else None
+    other = f"{graph.nodes[operator].params[name]}~"
+    for parameter in declared.entries if isinstance(declared, Table) else ():
+        settings = (*packed.settings, f"{parameter}={json.dumps(other)}")
+        try:
+            changed = load_bundle(replace(graph, sources_bundle=replace(packed, settings=settings)).bundle())
+        except GraphError:  # that parameter takes no such text
+            continue
+        if operator in changed.nodes and changed.nodes[operator].params[name] == other:
+            return parameter
+    return None
 
 
 def _load(

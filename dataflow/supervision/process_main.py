@@ -110,7 +110,7 @@ def _report(channel: Channel, error: BaseException, phase: str) -> None:
     operator = getattr(error, "operator", None)
     own: str | None = getattr(error, "traceback", None)
     text = cut("".join(traceback.format_exception(error)) if own is None else own, MOST_OF_A_TRACEBACK)
-    summary = cut(getattr(error, "summary", None) or f"{type(error).__name__}: {error}")
+    summary = cut(getattr(error, "told", None) or f"{type(error).__name__}: {error}")
     when, where = getattr(error, "when", ""), getattr(error, "where", "")
     try:
         channel.send("failed", operator=operator, when=when, phase=phase, summary=summary, where=where, traceback=text)

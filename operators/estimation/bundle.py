@@ -1,15 +1,59 @@
-"""Normal equations of poses and of the points that they see; the points are eliminated by the Schur complement.
+"""Poses and the points that they see: sightings, and normal equations without the points by the Schur complement.
 
 Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Holds observations: frames (S,) and points (S,) by index, and where they are seen (S, R), in pixels."""
+
+    frames: Indices
+    points: Indices
+    pixels: Array
+
+    @staticmethod
+    def none(size: int) -> Sightings:
+        """Returns none, at pixels (0, size)."""
+        return Sightings(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, size)))
+
+    def also(self, frame: int, points: Indices, pixels: Array) -> Sightings:
+        """Adds what one frame sees: points (N,) at pixels (N, R)."""
+        return Sightings(
+            np.concatenate([self.frames, np.full(len(points), frame)]),
+            np.concatenate([self.points, points]),
+            np.concatenate([self.pixels, pixels]),
+        )
+
+    def of_points(self, kept: Indices) -> Sightings:
+        """Returns the sightings of the points kept, numbered anew."""
+        number = np.full(max(int(self.points.max(initial=-1)), int(kept.max(initial=-1))) + 1, -1, np.int64)
+        number[kept] = np.arange(len(kept))
+        there = number[self.points] >= 0
+        return Sightings(self.frames[there], number[self.points[there]], self.pixels[there])
+
+    def without_first(self) -> Sightings:
+        """Returns the sightings of all frames but the first."""
+        later = self.frames > 0
+        return Sightings(self.frames[later] - 1, self.points[later], self.pixels[later])
+
+    def in_cameras(self, poses: Array, points: Array) -> tuple[Array, Array]:
+        """Returns what is seen of points (M, 3), each in its camera (S, 3), and R_camera_world (S, 3, 3)."""
+        inverse = invert(poses)
+        R = inverse[self.frames, :3, :3]
+        return np.einsum("sij,sj->si", R, points[self.points]) + inverse[self.frames, :3, 3], R
 
 
 def pose_jacobian(J: Array, points: Array) -> Array:

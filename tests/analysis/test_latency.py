@@ -48,7 +48,7 @@ def test_percentiles_are_over_all_firings(diamond: Graph) -> None:
     assert (path.count, path.p50, path.p99, path.largest) == (101, 66 * MS, 115 * MS, 116 * MS)
 
 
-def test_what_is_sampled_causes_nothing_while_there_is_a_trigger(diamond: Graph) -> None:
+def test_sampled_inputs_are_no_cause_while_there_is_a_trigger(diamond: Graph) -> None:
     given = one_round(diamond, 0, 100, slow=10)
     join = given["join"][0]
     given["lidar"] = [record("lidar", 0, 1, 0.5, stamp=-5)]

@@ -165,7 +165,7 @@ def test_recordings_and_streams_name_wrong_types(recording: dataflow.RecordedStr
             call()
 
 
-def test_a_session_names_what_is_no_dictionary_of_messages() -> None:
+def test_session_put_refuses_arguments_of_wrong_type() -> None:
     with dataflow.Session(watch()) as session:
         with pytest.raises(
             TypeError, match=r"Session\.put\(\): messages: expected a dictionary from texts to Messages"
@@ -194,7 +194,7 @@ FITS: list[tuple[Any, Any]] = [
 
 
 @pytest.mark.parametrize(("value", "wanted"), FITS)
-def test_what_stands_for_a_type_is_taken(value: Any, wanted: Any) -> None:
+def test_values_fitting_a_type_are_accepted(value: Any, wanted: Any) -> None:
     assert find_fault(value, wanted, "it") is None
 
 
@@ -215,7 +215,7 @@ def test_the_innermost_place_of_a_fault_is_named(value: Any, wanted: Any, place:
     assert fault.place == place
 
 
-def test_what_the_call_itself_refuses_is_left_to_it() -> None:
+def test_unknown_arguments_are_left_to_the_call() -> None:
     @checked
     def sized(width: int, *, height: int = 0) -> int:
         return width * height

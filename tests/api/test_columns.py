@@ -29,7 +29,7 @@ def test_vectors_scalars_and_timestamps_are_arrays(recording: dataflow.RecordedS
     assert imu["frame"].tolist() == ["imu"] * 11
 
 
-def test_columns_are_what_the_messages_hold(recording: dataflow.RecordedStreams) -> None:
+def test_columns_equal_the_message_fields(recording: dataflow.RecordedStreams) -> None:
     for stream in recording.select("imu", "image", "objects", "info").values():
         for name in stream.fields:
             values = [getattr(message, name) for message in stream]
@@ -97,7 +97,7 @@ def test_elements_of_messages_without_parallel_arrays_are_refused(recording: dat
         recording["imu"].elements()
 
 
-def test_without_pandas_a_table_says_what_to_install_and_columns_work(
+def test_frame_without_pandas_names_the_extra_and_columns_still_work(
     recording: dataflow.RecordedStreams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)

@@ -44,7 +44,7 @@ def test_a_graph_runs_and_reports(tmp_path: Path) -> None:
         assert recording.graph.name == "watch"
 
 
-def test_what_runs_here_is_what_runs_in_processes(tmp_path: Path) -> None:
+def test_run_in_this_process_equals_one_in_processes(tmp_path: Path) -> None:
     here = watch().run(record=tmp_path / "here.mcap")
     there = dataflow.launch(watch(), record=tmp_path / "there.mcap", placement="process_each")
 
@@ -139,7 +139,7 @@ def test_a_class_inside_a_function_is_refused_before_anything_runs() -> None:
         dataflow.Graph().add("inner", Inner)
 
 
-def test_a_failing_operator_is_named_and_the_recording_keeps_what_came_before(tmp_path: Path) -> None:
+def test_failing_operator_is_named_and_the_recording_keeps_earlier_messages(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     graph = dataflow.Graph("fails", namespace="shop").add("camera", Camera).add("broken", Broken)
     with pytest.raises(RunFailed, match="operator 'broken' failed in fire at stamp 300000000: ValueError") as caught:
@@ -166,7 +166,7 @@ def test_ctrl_c_ends_a_run_in_order_and_its_recording_verifies(tmp_path: Path, m
     assert dataflow.replay(path).report.streams["shop/counter/count"][0] == 3
 
 
-def test_a_replay_from_the_middle_goes_on_with_the_state_of_then(tmp_path: Path) -> None:
+def test_replay_from_the_middle_restores_the_state(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     graph = dataflow.Graph("count", namespace="shop").add("camera", Camera).add("counter", Counting)
     graph.connect("counter", image="camera/image").run(record=path)

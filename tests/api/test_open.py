@@ -32,7 +32,7 @@ def test_a_name_that_means_nothing_is_an_error_with_the_nearest_one(recording: d
     assert "gyro" not in recording
 
 
-def test_a_name_that_means_several_streams_says_which(recording: dataflow.RecordedStreams) -> None:
+def test_ambiguous_stream_name_error_lists_the_streams(recording: dataflow.RecordedStreams) -> None:
     with pytest.raises(StreamNameError, match=r"means 2 streams: r1/camera/image, r1/camera/info; select\(\)"):
         recording["camera/*"]
 

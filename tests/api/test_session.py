@@ -54,14 +54,14 @@ def test_a_session_gives_the_messages_of_a_run_and_its_recording_verifies(
     assert [again[f"robot1/{name}"] for name in made] == [first[f"robot1/{name}"] for name in made]
 
 
-def test_what_follows_from_frontiers_alone_comes_with_the_step_that_decides_it(run: dataflow.RunResult) -> None:
+def test_session_step_returns_no_undecided_messages(run: dataflow.RunResult) -> None:
     first = run.open()["image"][0]
     with dataflow.Session(small(), static=statics(run)) as session:
         assert "cloud/cloud" not in session.put(first.stamp, {"camera/image": first})
         assert session.put(first.stamp + 1, {}) == {}
 
 
-def test_an_input_that_does_not_fit_is_refused_and_the_session_goes_on(run: dataflow.RunResult) -> None:
+def test_session_refuses_a_mismatched_input_and_continues(run: dataflow.RunResult) -> None:
     first, second = run.open()["image"][:2]
     with dataflow.Session(small(), static=statics(run)) as session:
         session.put(first.stamp, {"camera/image": first})
@@ -78,7 +78,7 @@ def test_an_input_that_does_not_fit_is_refused_and_the_session_goes_on(run: data
         session.put(second.stamp + 1, {})
 
 
-def test_what_is_missing_at_the_beginning_is_named(run: dataflow.RunResult) -> None:
+def test_session_without_required_streams_names_the_missing_one(run: dataflow.RunResult) -> None:
     with pytest.raises(ValueError, match="no message for the static stream 'camera/depth_info'"):
         dataflow.Session(small(), static={k: v for k, v in statics(run).items() if "depth" not in k})
     with pytest.raises(ValueError, match="no stream 'cloud/clouds'"):

@@ -16,7 +16,7 @@ from dataflow.graph import load_graph
 SPACE = "{http://www.w3.org/2000/svg}"
 
 
-def test_operators_stand_behind_what_they_take() -> None:
+def test_operators_are_drawn_after_their_inputs() -> None:
     graph = dataflow.Graph("watch").add("judge", Judge).add("meter", Photometer).add("camera", Camera)
     graph.connect("meter", image="camera/image").connect(
         "judge", brightness="meter/brightness", exposure="camera/exposure"

@@ -203,7 +203,7 @@ def test_of_a_batch_the_message_that_decided_is_named(tmp_path: Path) -> None:
     assert [link.message for link in own] == [("blamed/src/a", 0, max(readings, key=readings.__getitem__))]
 
 
-def test_a_state_has_forgotten_what_was_before_it_was_set_anew(two: Path) -> None:
+def test_state_forgets_calls_before_its_reassignment(two: Path) -> None:
     flags = [blamed_graphs.reading(0, "b", k) >= blamed_graphs.HALF for k in range(blamed_graphs.STEPS)]
     k = next(k for k in range(20, blamed_graphs.STEPS) if not any(flags[k - 2 : k]))
     last = max(n for n in range(k) if flags[n])
@@ -301,7 +301,7 @@ def test_numbers_differ_by_more_than_a_part_of_the_largest_and_others_at_all() -
     assert not differ({"a": [1]}, {"a": [1]}, 0.0)
 
 
-def test_single_whole_numbers_are_nudged_behind_what_is_measured() -> None:
+def test_integer_scalars_are_not_nudged_with_measurements() -> None:
     boxes = np.array([[1.0, 1.0, 2.0, 2.0]], np.float32)
     scores, classes = np.ones(1, np.float32), np.zeros(1, np.int32)
     found = Detections2D(

@@ -70,7 +70,7 @@ def test_latch_behind_low_pass_leads_to_the_reading_that_tripped_it(step: int, s
     assert {effect.together for effect in row.effects} == {row.last + 1 - rangers.SPIKE}
 
 
-def test_a_lost_echo_that_decided_is_made_finite_and_a_threshold_is_met_from_either_side(approaching: Path) -> None:
+def test_lost_echo_and_threshold_are_blamed_for_the_decision(approaching: Path) -> None:
     step = next(k for k in range(rangers.STEPS) if rangers.approaching(k) == pytest.approx(1.9))
 
     chain = found(approaching, f"brake/stop.on@{step / 10}")
@@ -81,7 +81,7 @@ def test_a_lost_echo_that_decided_is_made_finite_and_a_threshold_is_met_from_eit
     assert chain.whole
 
 
-def test_what_changes_a_value_most_is_named_first(spiky: Path) -> None:
+def test_blame_names_the_largest_effect_first(spiky: Path) -> None:
     chain = found(spiky, "smooth/out.value@4")
 
     assert sensed(chain)[0] == rangers.SPIKE

@@ -38,9 +38,7 @@ def chain(value: object, *links: Link) -> Chain:
         (np.array([1.0, np.nan]), np.array([9.0, 2.0]), np.inf),
     ],
 )
-def test_a_change_is_the_largest_difference_of_numbers_and_of_anything_else_without_bound(
-    before: object, after: object, by: float
-) -> None:
+def test_change_is_the_largest_numeric_difference_else_infinite(before: object, after: object, by: float) -> None:
     assert change(before, after) == by
 
 
@@ -52,7 +50,7 @@ def test_values_of_several_kinds_differ_by_their_content() -> None:
     assert differ(1, 1.0, 0.5)
 
 
-def test_a_nudge_weighs_as_much_as_the_whole_of_a_number_and_other_content_stands_behind() -> None:
+def test_link_weight_combines_nudges_and_replaced_content() -> None:
     def weighed(value: object, *effects: tuple[Way, object]) -> tuple[float, float]:
         return chain(value).weight(link(TARGET, None, *(Effect(way, (), after) for way, after in effects)))
 
@@ -62,7 +60,7 @@ def test_a_nudge_weighs_as_much_as_the_whole_of_a_number_and_other_content_stand
     assert weighed(5.0, ("the one before", 5.5), ("another", 5.25)) == (0.0, 0.5)
 
 
-def test_a_call_leads_on_by_its_inputs_or_by_a_state_that_a_later_call_had_of_an_earlier_one() -> None:
+def test_calls_are_linked_by_inputs_or_by_state() -> None:
     nudge = Effect("nudged", (), 1.0)
     track, early = Call("track", 5), Call("track", 2)
     found = chain(0.0, link(TARGET, track, nudge), link(Call("track", 7), early, nudge, name=""))
@@ -72,7 +70,7 @@ def test_a_call_leads_on_by_its_inputs_or_by_a_state_that_a_later_call_had_of_an
     assert found.loose_of([early, Call("track", 8), Call("map", 5)]) == [early, Call("track", 8), Call("map", 5)]
 
 
-def test_calls_that_count_only_by_another_content_beside_one_of_its_own_need_not_lead_on() -> None:
+def test_calls_that_count_only_by_other_content_need_no_further_link() -> None:
     nudge, other = Effect("nudged", (), 1.0), Effect("the one before", (), 1.0)
     aside, behind, own = Call("clock", 1), Call("drift", 1), Call("track", 5)
     beside = [link(TARGET, own, nudge), link(TARGET, aside, other), link(aside, behind, nudge)]

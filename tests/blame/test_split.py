@@ -28,7 +28,7 @@ def shown_by(decides: Callable[[set[int]], bool]) -> Callable[[Sequence[int]], t
     ],
     ids=["one", "several", "a run", "both ends", "one and a run", "none"],
 )
-def test_what_decides_alone_is_found_the_last_first_else_the_shortest_run_that_does(
+def test_split_finds_deciding_items_last_first_else_the_shortest_run(
     decides: Callable[[set[int]], bool], found: list[list[int]]
 ) -> None:
     shows = shown_by(decides)

@@ -47,7 +47,7 @@ def captured(path: Path, operator: str = "bug", number: int | None = None, predi
         return capture(recording, Debugger(recording, operator), number, predicate).captured
 
 
-def test_a_captured_call_comes_back_from_its_file(late: Path) -> None:
+def test_captured_call_survives_its_file(late: Path) -> None:
     made = captured(late)
     read = CapturedCalls.from_bytes(made.to_bytes())
 
@@ -59,7 +59,7 @@ def test_a_captured_call_comes_back_from_its_file(late: Path) -> None:
         CapturedCalls.from_bytes(b"something else")
 
 
-def test_what_is_as_recorded_is_refused(late: Path) -> None:
+def test_capturing_a_call_without_error_is_refused(late: Path) -> None:
     with pytest.raises(DebugError, match="call 3 of bug: as recorded, no error"):
         captured(late, number=3)
     with pytest.raises(DebugError, match="bug has 401 calls: none for which stamp < 0"):
@@ -73,9 +73,7 @@ def test_a_predicate_about_any_call_is_captured(late: Path) -> None:
     assert made.shots[0].firing.inputs["rare"] == ()  # not needed for that
 
 
-def test_a_state_that_holds_the_bug_is_begun_with_only_where_the_calls_are_too_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_capture_starts_from_a_state_only_with_too_many_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = seeded_bugs.recorded(bugs.Case(bugs.Drifts), tmp_path / "run.mcap")
 
     made = captured(path)

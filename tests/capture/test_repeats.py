@@ -66,7 +66,7 @@ def test_a_call_that_repeats_is_captured(tmp_path: Path) -> None:
     assert len(made.shots) == 1
 
 
-def test_capture_is_not_advised_for_what_does_not_repeat(tmp_path: Path) -> None:
+def test_capture_is_not_advised_for_an_unrepeatable_operator(tmp_path: Path) -> None:
     path = recorded("Entropy", tmp_path / "run.mcap")
     told = CliRunner().invoke(app, ["verify", str(path)])
 

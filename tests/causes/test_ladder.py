@@ -128,7 +128,7 @@ def test_more_causes_than_there_are_re_runs_for_stay_open_and_are_not_guessed() 
     assert causes == set(found.causes).union(*found.open)
 
 
-def test_what_differs_with_everything_fixed_has_no_known_cause() -> None:
+def test_difference_with_all_sources_fixed_has_no_known_cause() -> None:
     found = climbed(Operator({WALL}, differs=True))
 
     assert found.settled is False
@@ -143,7 +143,7 @@ def test_sources_that_cannot_be_fixed_here_are_not_tried() -> None:
 
 
 @pytest.mark.parametrize("cause", [HASHES, HEAP, MODULE, THREADS, *MOVED, LOCALE, GAIN, TABLE, MODELS, WORKING])
-def test_what_a_repeating_operator_depends_on_is_named(cause: str) -> None:
+def test_source_on_which_a_repeating_operator_depends_is_named(cause: str) -> None:
     found = climbed(Repeating({cause}, reads={WALL, GAIN}), repeats=True)
 
     assert found.repeats
@@ -151,7 +151,7 @@ def test_what_a_repeating_operator_depends_on_is_named(cause: str) -> None:
 
 
 @pytest.mark.parametrize("cause", [MONOTONIC, ADDRESSES])
-def test_a_source_by_which_runs_agree_by_chance_is_found_past_the_log_and_beside_others(cause: str) -> None:
+def test_cause_with_agreeing_runs_is_found_beside_other_causes(cause: str) -> None:
     """The difference of two readings of a clock, rounded to 10 ms, is 0 in two quiet runs."""
     operator = Repeating({cause, ENTROPY, HEAP}, reads={WALL, GAIN})
 
@@ -182,7 +182,7 @@ def test_threads_that_repeat_among_themselves_are_no_cause() -> None:
     assert found.causes == [UUID]
 
 
-def test_a_process_that_dies_of_what_is_left_free_shows_a_cause() -> None:
+def test_process_death_by_an_unfixed_source_reveals_the_cause() -> None:
     operator = Operator(())
 
     def fire(setting: RerunSettings) -> Rerun:

@@ -29,5 +29,5 @@ def test_the_other_moment_of_compiled_clocks_differs_below_the_second_too(monkey
         (RerunSettings(varied=frozenset("abcde")), "changed: a, b, c and 2 more"),
     ],
 )
-def test_what_a_re_run_tries_is_shown_while_it_runs(setting: RerunSettings, words: str) -> None:
+def test_rerun_describes_its_setting(setting: RerunSettings, words: str) -> None:
     assert setting.words == words

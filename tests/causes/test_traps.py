@@ -94,7 +94,7 @@ def test_waits_of_the_standard_library_are_no_clock_of_the_operator(logged: set[
     assert not [line for _, line in logged if "wait" in line]
 
 
-def test_what_is_fixed_is_the_same_in_every_process_and_nothing_else_is() -> None:
+def test_fixed_sources_alone_are_equal_in_every_process() -> None:
     fixed = FIX.format(module="chancy", fixed=set(CHANCE), varied=set())
     free = FIX.format(module="chancy", fixed=set(), varied=set())
 
@@ -126,7 +126,7 @@ def test_a_source_that_is_left_free_is_free_alone(free: str, changes: set[str]) 
     assert {key for key in one if one[key] != other[key]} == changes
 
 
-def test_what_was_given_is_known_also_where_compiled_code_asked() -> None:
+def test_fixed_values_are_noted_when_compiled_code_reads_them() -> None:
     program = FIX.format(module="given", fixed=set(CHANCE), varied=set()) + "print(interventions.given)"
 
     sorted_by_id, given = ran(program).splitlines()
@@ -195,7 +195,7 @@ def test_an_uneven_clock_takes_steps_of_a_microsecond_and_of_a_third_of_a_second
     assert 200_000_000 < max(steps) <= 300_000_000
 
 
-def test_what_is_varied_differs() -> None:
+def test_varied_sources_differ() -> None:
     varied = {sources.WALL, sources.named(sources.VARIABLE, "CHANCY")}
 
     found = eval(ran(FIX.format(module="chancy", fixed=set(), varied=varied)), NAMES)
@@ -224,7 +224,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_files_that_are_read_at_import_or_looked_at_and_folders_that_are_listed_are_logged_and_no_others(
+def test_only_accessed_files_and_listed_folders_are_logged(
     folder: Path,
 ) -> None:
     found = json.loads(ran(LOG.format(module="looking"), LOOKING=str(folder)))
@@ -238,7 +238,7 @@ def test_files_that_are_read_at_import_or_looked_at_and_folders_that_are_listed_
     }
 
 
-def test_a_file_that_is_hidden_is_neither_found_nor_listed_and_the_working_folder_has_another_name(
+def test_hidden_files_are_absent_and_the_working_folder_is_renamed(
     folder: Path,
 ) -> None:
     hidden = {sources.named(sources.FILE, str(folder / name)) for name in FILES[1:]}

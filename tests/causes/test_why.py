@@ -102,7 +102,9 @@ DIFFERENCE = Difference(0, "fire", 1, "out", "a", "b")
         (Verification("x", first=DIFFERENCE, own_fault=True), {}, ""),
     ],
 )
-def test_what_repeats_or_cannot_be_run_again_is_refused(found: Verification, more: dict[str, Any], reason: str) -> None:
+def test_search_for_causes_refuses_repeating_or_unrunnable_operators(
+    found: Verification, more: dict[str, Any], reason: str
+) -> None:
     made = report(found, **more)
 
     assert refusal(made, "x", next((v for v in made.operators if v.operator == "x"), None)) == reason
@@ -117,7 +119,7 @@ def test_what_repeats_or_cannot_be_run_again_is_refused(found: Verification, mor
         (False, True, set(), {"folder", "environment variable"}),
     ],
 )
-def test_what_may_be_as_it_was_is_no_cause_where_the_operator_or_a_file_has_changed(
+def test_possibly_unchanged_sources_are_no_cause_if_code_or_files_changed(
     newer: bool, revised: bool, causes: set[str], also: set[str]
 ) -> None:
     findings = Findings(Rerun(("",)), repeats=True, causes=["folder:models", "environment variable:GAIN"])
@@ -130,7 +132,7 @@ def test_what_may_be_as_it_was_is_no_cause_where_the_operator_or_a_file_has_chan
     assert {cause["cause"] for cause in found.as_json()["also"]} == also
 
 
-def test_what_makes_runs_differ_is_a_cause_whatever_has_changed() -> None:
+def test_nondeterminism_is_a_cause_though_the_code_changed() -> None:
     findings = Findings(Rerun(("",)), repeats=False, settled=True, causes=["wall clock"])
 
     assert _answer(findings, None, None, Verification("x"), revised=True).causes
@@ -145,7 +147,7 @@ def test_facts_of_the_machine_are_no_change_of_an_operator() -> None:
     assert made.altered("x") == ("code of op", "numpy 1 → 2", "cpu: a → b")
 
 
-def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_before(tmp_path: Path) -> None:
+def test_file_copied_with_its_times_is_newer_than_an_earlier_recording(tmp_path: Path) -> None:
     copied = tmp_path / "cfg.json"
     copied.write_text("{}")
     os.utime(copied, (1.0, 1.0))
@@ -156,7 +158,7 @@ def test_a_file_that_was_copied_with_its_times_is_newer_than_a_recording_made_be
     assert not _Alone.is_newer(alone, str(copied), Verification("x"))
 
 
-def test_changed_code_is_reported_before_what_the_results_also_depend_on() -> None:
+def test_changed_code_is_reported_before_other_dependencies() -> None:
     gain = Cause("environment variable:GAIN", (Site("/robot/op.py", 20, "setup", "os.environ"),), 1)
     console = Console(file=io.StringIO(), width=200)
 

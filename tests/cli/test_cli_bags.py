@@ -46,7 +46,7 @@ def test_a_ros_1_bag_is_drawn_too(dataflow, tmp_path: Path) -> None:
     assert "3 messages" in dataflow("view", file, "--to", tmp_path / "old.rrd").stdout
 
 
-def test_a_dataset_takes_what_is_left_without_the_other_streams_of_a_kind(dataflow, bag: Path, tmp_path: Path) -> None:
+def test_converting_to_a_dataset_takes_the_streams_left_by_without(dataflow, bag: Path, tmp_path: Path) -> None:
     assert "give one with --to: mcap, ros2, foxglove" in dataflow("convert", bag, tmp_path / "a", code=2).stderr
     refused = dataflow("convert", bag, tmp_path / "a", "--to", "tum", code=2).stderr
     assert "--without all but one of /estimate, /truth" in " ".join(refused.split())
@@ -66,7 +66,7 @@ def test_a_graph_that_comes_with_dataflow_is_named_for_a_bag_too(dataflow, bag: 
 
 
 @pytest.mark.long
-def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_path: Path) -> None:
+def test_star_within_a_part_matches_any_characters(dataflow, recorded, tmp_path: Path) -> None:
     told = dataflow("filter", recorded[0], "--stream", "left/*st", "-o", tmp_path / "part.mcap", "--json").stdout
 
     assert "test/left/fast" in told
@@ -101,7 +101,7 @@ def test_a_recording_may_be_converted_in_its_place(dataflow, recorded, tmp_path:
 
 
 @pytest.mark.parametrize("command", ["latency", "verify", "diff"])
-def test_a_ros_1_bag_where_a_recording_is_expected_is_answered_with_what_makes_one(
+def test_ros_1_bag_in_place_of_a_recording_is_refused_with_the_conversion(
     dataflow, tmp_path: Path, command: str
 ) -> None:
     from made_bags import ROS1
@@ -163,7 +163,7 @@ operators:
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
-def test_options_of_a_replayed_bag_choose_what_is_played(
+def test_options_of_a_replayed_bag_select_its_messages(
     dataflow, film: Path, tmp_path: Path, words: tuple[str, ...], stamps: list[float], said: str
 ) -> None:
     from dataflow.recording import Recording

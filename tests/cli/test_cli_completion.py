@@ -55,7 +55,7 @@ def test_bash_completes_commands_options_and_graphs(program: Path) -> None:
     assert completed(program, "dataflow param s") == ["set"]
 
 
-def test_names_of_what_runs_are_completed() -> None:
+def test_names_of_running_graphs_are_completed() -> None:
     streams = [{"name": "robot1/camera/image"}, {"name": "robot1/cloud/cloud"}]
     graph = {"streams": streams, "nodes": [{"name": "camera"}, {"name": "cloud"}]}
     with register("watch", "robot1", ["unixsock-stream//x"], graph):

@@ -41,7 +41,7 @@ def debug(*words: str, lines: str = "", code: int = 0) -> str:
     return done.stdout + done.stderr
 
 
-def test_a_call_is_shown_with_what_was_given_made_and_changed() -> None:
+def test_call_is_shown_with_inputs_outputs_and_state_changes() -> None:
     told = debug("smooth@1", "--do", "state", "--do", "inputs", "--do", "print out.mean.vectors.shape")
 
     assert "smooth  call 29 of 42" in told
@@ -79,7 +79,7 @@ def test_pdb_stops_at_the_first_line_of_process() -> None:
 
 
 @pytest.mark.long
-def test_pdb_that_is_left_leaves_the_call_as_it_was() -> None:
+def test_leaving_pdb_keeps_the_call_as_recorded() -> None:
     told = debug("smooth", lines="step\nq\nquit\n")
 
     assert told.count("as recorded") == 2
@@ -137,7 +137,7 @@ def prompt(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Shell, Drawing]]:
         debugger.close()
 
 
-def test_the_viewer_is_given_what_calls_that_are_gone_to_were_given_and_made(prompt: tuple[Shell, Drawing]) -> None:
+def test_viewer_shows_inputs_and_outputs_of_visited_calls(prompt: tuple[Shell, Drawing]) -> None:
     shell, viewer = prompt
     shell.onecmd("goto 4")
     shell.onecmd("goto 2")
@@ -198,7 +198,7 @@ def test_an_interrupt_clears_the_line_and_stays(
 
 
 @pytest.mark.long
-def test_what_cannot_begin_is_named() -> None:
+def test_debugging_an_unknown_operator_or_call_is_refused() -> None:
     assert "there are: busy, look, smooth, tally" in debug("none", code=2)
     assert "expected the number of a call, or @SECONDS" in debug("busy@x", code=2)
 

@@ -31,7 +31,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.long
-def test_the_loss_is_named_with_what_it_cost_and_what_is_not_known(dataflow, run: str) -> None:
+def test_drops_names_the_loss_its_cost_and_what_the_file_lacks(dataflow, run: str) -> None:
     told = dataflow("drops", run, "--worse", "end_error > 5", "--path", SUPPORT, "--budget", "60").stdout
 
     assert "1.000 s" in told

@@ -58,7 +58,7 @@ def test_a_split_is_as_long_and_as_large_as_asked(dataflow, recorded: Recorded, 
     assert "--size 5XB" in dataflow("split", recorded[0], "--size", "5XB", code=2).stderr
 
 
-def test_a_torn_file_is_recovered_and_what_is_lost_is_counted(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+def test_recover_saves_a_torn_file_and_reports_it(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     torn, saved = tmp_path / "torn.mcap", tmp_path / "saved.mcap"
     data = recorded[0].read_bytes()
     torn.write_bytes(data[: len(data) * 2 // 3])
@@ -74,7 +74,7 @@ def test_a_torn_file_is_recovered_and_what_is_lost_is_counted(dataflow, recorded
     assert "no file" in dataflow("recover", tmp_path / "none.mcap", "-o", saved, code=2).stderr
 
 
-def test_a_bag_that_is_no_mcap_is_answered_with_what_makes_one(dataflow, tmp_path: Path) -> None:
+def test_bag_that_is_no_mcap_is_refused_with_the_conversion(dataflow, tmp_path: Path) -> None:
     bag = tmp_path / "drive.bag"
     bag.write_bytes(b"#ROSBAG V2.0\n")
 

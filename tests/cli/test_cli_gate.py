@@ -167,7 +167,7 @@ def without_message(path: Path, stream: str, number: int, target: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("one", [SMOOTH, NUDGED])
-def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
+def test_unrepeatable_operator_is_not_accepted_and_ends_with_1(
     dataflow, folder: Path, tmp_path: Path, one: str
 ) -> None:
     torn, baseline = tmp_path / "torn.mcap", tmp_path / "accepted.json"

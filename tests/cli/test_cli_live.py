@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from background_run import Background
+from attached_run import AttachedRun
 
 from dataflow.cli.commands.following.live import _Rate
 from dataflow.graph import load_graph
@@ -19,17 +19,17 @@ from dataflow.supervision.plan import RunPlan
 
 
 @pytest.fixture(scope="module")
-def running(small: Path) -> Iterator[Background]:
+def running(small: Path) -> Iterator[AttachedRun]:
     """A graph that runs as long as the tests of this file need."""
     graph = load_graph(small, settings=["count=1000000", "sleep=0.02"])
-    background = Background(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
+    background = AttachedRun(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
     yield background
     if background.thread.is_alive():
         background.end()
 
 
 @pytest.mark.usefixtures("running")
-def test_list_shows_the_running_graph_and_who_takes_its_streams(dataflow) -> None:
+def test_list_shows_the_running_graph_and_its_consumers(dataflow) -> None:
     told = dataflow("list").stdout
     assert f"namespace test, process {os.getpid()}" in told
     assert "smooth.x, gripper.x" in told
@@ -114,7 +114,7 @@ def test_a_stream_that_the_graph_does_not_have_is_refused_at_once(dataflow) -> N
 
 
 @pytest.mark.usefixtures("running")
-def test_hz_knows_the_rate_by_stamp(dataflow) -> None:
+def test_hz_prints_the_rate_by_stamp(dataflow) -> None:
     rows = json.loads(dataflow("hz", "left/fast", "--seconds", 0.5, "--json").stdout)
     (row,) = rows
     assert row["stream"] == "test/left/fast"
@@ -128,7 +128,7 @@ def test_hz_knows_the_rate_by_stamp(dataflow) -> None:
     assert "left/fast" in told
 
 
-def test_rates_over_a_window_forget_what_came_before() -> None:
+def test_rates_over_a_window_ignore_earlier_messages() -> None:
     rate = _Rate()
     for second in range(10):  # ten a second stamped, one a second by the clock, until the last two
         rate.seen.append((float(second), second * 10**8, second, 100))
@@ -142,7 +142,7 @@ def test_rates_over_a_window_forget_what_came_before() -> None:
     assert rate.row("s")["hz_clock"] is None
 
 
-def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: Background) -> None:
+def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: AttachedRun) -> None:
     told = dataflow("echo", "--graph", "kitchen", code=2).stderr
     assert "no graph 'kitchen' runs on this machine (running: small)" in told
     assert "0 or more" in dataflow("hz", "--wait", "-1", code=2).stderr
@@ -172,7 +172,7 @@ def test_trigger_without_flight_recorder_and_invalid_playback_words_are_refused(
 
 
 @pytest.mark.usefixtures("running")
-def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
+def test_run_is_paused_stepped_and_resumed(dataflow) -> None:
     assert dataflow("playback", "pause").stdout.startswith("paused at ")
     before = json.loads(dataflow("playback", "status", "--json").stdout)
     assert before["paused"]
@@ -185,7 +185,7 @@ def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
     assert "as fast as it goes" in told
 
 
-def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
+def test_view_follows_the_graph_to_its_end_and_saves_it(dataflow, running: AttachedRun, tmp_path: Path) -> None:
     """The last test of the file: it ends the graph."""
     saved = tmp_path / "live.rrd"
     threading.Timer(1.0, running.supervisor.stop).start()

@@ -173,7 +173,7 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     assert "wrote   out/run.mcap (1 message, 5.0 MB)" in lines
 
 
-def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
+def test_progress_without_a_start_shows_no_duration() -> None:
     console = Console(file=io.StringIO(), width=100)
     with shown(console, RunDisplay(console), quiet=False) as watch:
         assert watch is not None
@@ -266,7 +266,7 @@ def printed(report: RunReport, width: int = 200) -> list[str]:
     return text_of(console)
 
 
-def test_what_matters_comes_first_and_the_rest_is_asked_for() -> None:
+def test_summary_lists_rates_losses_and_files_first() -> None:
     wrote = {"path": "out/a_000.mcap", "parts": ["out/a_000.mcap", "out/a_001.mcap"], "messages": 9, "bytes": 5_000_000}
     report = replace(lossy_report(), files={"@recorder": wrote}, sources=("camera",))
 
@@ -288,7 +288,7 @@ def test_scores_of_many_operators_are_one_of_each_and_no_lists() -> None:
     assert printed(report)[1] == "scores  score_0: iou 0.5; score_1: iou 0.5; score_2: iou 0.5; score_3: iou 0.5"
 
 
-def test_parts_of_the_runtime_are_called_what_they_are() -> None:
+def test_runtime_processes_are_printed_by_their_role() -> None:
     operators = {"@log": OperatorCounts(100, 100, 0, 0, 0)} | dict(lossy_report().operators)
     report = replace(lossy_report(), operators=operators)
     status = Status(waiting=("@log", "odometry", "@recorder"))
@@ -320,7 +320,7 @@ def test_summary_has_findings_losses_and_notes_once(changed: dict[str, Any], lin
     assert printed(replace(lossy_report(), **changed)).count(line) == 1
 
 
-def test_what_a_flight_recorder_could_not_keep_is_among_the_losses() -> None:
+def test_failed_flight_recordings_are_listed_among_the_losses() -> None:
     """Not among what it has kept, though its name stands there."""
     kept = {"path": "a.mcap", "reasons": [{"what": "asked for"}], "bytes": 5_000_000}
     failed = {"path": "b.mcap", "reasons": [{"what": "asked for"}], "bytes": 0, "error": "no space"}

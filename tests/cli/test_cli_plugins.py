@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from dataflow.cli import plugins
 from dataflow.cli.main import app
-from dataflow.cli.support import plugins
 
 MODULE = '''
 import typer

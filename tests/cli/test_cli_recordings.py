@@ -20,7 +20,7 @@ def longer(dataflow, small: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return path
 
 
-def test_info_shows_streams_and_what_made_them(dataflow, recorded) -> None:
+def test_info_shows_streams_and_their_graph(dataflow, recorded) -> None:
     path, _ = recorded
     told = dataflow("info", path).stdout
 
@@ -40,7 +40,7 @@ def test_info_prints_the_digests_of_the_run_as_json(dataflow, recorded) -> None:
     assert described["digests"] == {name: stream["digest"] for name, stream in report["streams"].items()}
 
 
-def test_info_lists_what_else_the_file_carries(dataflow, tmp_path: Path) -> None:
+def test_info_lists_attachments_and_metadata(dataflow, tmp_path: Path) -> None:
     path = tmp_path / "carrying.mcap"
     with RecordingWriter(path, metadata={}) as writer:
         writer.add_stream("test/number", Number)

@@ -155,7 +155,7 @@ def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("asked", ["0", "1"])
-def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_asked_for(
+def test_damaged_recording_is_one_line_and_the_traceback_optional(
     damaged: Path, monkeypatch: pytest.MonkeyPatch, asked: str
 ) -> None:
     monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
@@ -169,9 +169,7 @@ def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_ask
     assert asked == "1" or told.stderr.splitlines()[1:] == ["where in the code: run it again with DATAFLOW_TRACEBACK=1"]
 
 
-def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_is_left(
-    dataflow, small: Path, tmp_path: Path
-) -> None:
+def test_failing_operator_ends_the_run_with_traceback_and_recording(dataflow, small: Path, tmp_path: Path) -> None:
     path = tmp_path / "failed.mcap"
 
     told = dataflow("run", small, "--set", "at=20", "--one-process", "--record", path, code=1)
@@ -226,7 +224,7 @@ class Reader(Source):
 """
 
 
-def test_data_that_is_not_there_is_one_line_and_the_parameter_that_names_other_data(dataflow, tmp_path: Path) -> None:
+def test_missing_data_is_one_line_with_the_parameter_to_set(dataflow, tmp_path: Path) -> None:
     (tmp_path / "absent_reader.py").write_text(ABSENT)
     (tmp_path / "absent.yaml").write_text(
         f"graph: absent\noperators:\n  camera: {{use: 'absent_reader:Reader', params: {{path: {tmp_path}/nowhere}}}}\n"

@@ -248,7 +248,7 @@ def test_messages_that_cannot_be_read_are_passed_over_and_counted(tmp_path: Path
         assert len(stream.stamps) == len(read)
 
 
-def test_what_cannot_be_read_in_both_is_not_the_same(tmp_path: Path) -> None:
+def test_streams_unreadable_in_both_recordings_are_different(tmp_path: Path) -> None:
     path = damaged_chunk(tmp_path / "a.mcap")
     with Recording(path) as a, Recording(path) as b:
         report = diff(a, b)
@@ -321,7 +321,7 @@ def test_a_definition_that_is_broken_costs_its_own_topic(dataflow, tmp_path: Pat
     assert list(told["lost"]["/good"].values()) == [1]
 
 
-def test_a_replay_of_a_damaged_file_counts_what_is_lost_in_words_and_in_json(dataflow, tmp_path: Path) -> None:
+def test_replay_of_a_damaged_file_counts_losses_in_text_and_json(dataflow, tmp_path: Path) -> None:
     path, graph = damaged_chunk(tmp_path / "a.mcap"), tmp_path / "g.yaml"
     graph.write_text(GRAPH)
     words = ("replay", path, "--graph", graph, "--one-process")
@@ -344,7 +344,7 @@ def test_files_of_a_folder_that_are_no_parts_of_one_are_not_read_as_one(dataflow
     dataflow("info", tmp_path)
 
 
-def test_python_warns_of_what_a_file_lacks(tmp_path: Path) -> None:
+def test_python_api_warns_of_damaged_files(tmp_path: Path) -> None:
     graph = tmp_path / "g.yaml"
     graph.write_text(GRAPH)
     with pytest.warns(UserWarning, match="no proper end"), api.open(torn(tmp_path / "a.mcap")):

@@ -24,7 +24,7 @@ LOADED = "import sys; import {}; print(*(name for name in {!r}.split() if name i
         ("dataflow.supervision.early_nursery", "numpy zenoh pydantic mcap dataflow.graph.load"),
     ],
 )
-def test_what_is_not_needed_is_not_imported(modules: str, heavy: str) -> None:
+def test_commands_import_no_heavy_modules(modules: str, heavy: str) -> None:
     code = LOADED.format(modules, heavy)
     command = [sys.executable, "-P", "-c", code]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}

@@ -114,7 +114,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(recorded) -> None:
 
 
 @pytest.mark.long
-def test_a_command_works_where_the_current_folder_is_gone(recorded, tmp_path: Path) -> None:
+def test_command_works_in_a_deleted_working_directory(recorded, tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     told = shell('rmdir "$PWD"; exec "$@"', "info", recorded[0], folder=gone)

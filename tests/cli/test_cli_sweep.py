@@ -206,7 +206,7 @@ def test_streams_are_those_of_the_operator_that_makes_them() -> None:
     assert math.isnan(one[0]["figures"]["error"])
 
 
-def test_streams_are_told_apart_where_a_namespace_ends_as_an_operator_begins() -> None:
+def test_streams_are_distinct_where_namespace_and_operator_share_a_name() -> None:
     counts = {"firings": 1, "emitted": 1, "dropped": 0, "cpu_ms": 1.0, "wall_ms": 1.0}
     run = {"operators": {"x": counts, "ns/x": counts}, "restarts": {}, "summaries": {}}
 
@@ -228,7 +228,7 @@ def test_each_recording_counts_once_whatever_its_name_and_its_parts(folder: Path
     assert sorted(source.name for source in found) == ["alone.mcap", "caf\\udce9.mcap", "gap", "parted"]
 
 
-def test_a_failure_is_kept_with_what_it_printed_and_the_others_go_on(sweep: Sweep, tmp_path: Path) -> None:
+def test_failed_run_keeps_its_error_and_the_others_continue(sweep: Sweep, tmp_path: Path) -> None:
     words = ("--set", "scaled.fail_at=5,1e9")
     told = sweep(*words, recordings="runs/first.mcap", code=1)
 
@@ -256,7 +256,7 @@ def test_killed_process_is_started_again_and_loses_nothing(sweep: Sweep, tmp_pat
 
 
 @pytest.mark.long
-def test_what_takes_too_long_is_ended_and_tried_again_by_the_next_sweep(sweep: Sweep, tmp_path: Path) -> None:
+def test_timed_out_runs_are_retried_by_the_next_sweep(sweep: Sweep, tmp_path: Path) -> None:
     marker = tmp_path / "wait"
     marker.write_text("")
     words = ("--set", f"scaled.wait={tmp_path}", "--jobs", "2")

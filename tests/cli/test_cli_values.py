@@ -70,14 +70,14 @@ def both(words: list[str]) -> tuple[Any, Any]:
         ["--flag", "--word", ""],
     ],
 )
-def test_a_word_means_what_typer_makes_of_it(words: list[str]) -> None:
+def test_word_is_parsed_as_by_typer(words: list[str]) -> None:
     plain, checked = both(words)
 
     assert repr(plain) == repr(checked)  # 1 is not 1.0, nan is nan
 
 
 @given(option=st.sampled_from(["--whole", "--part", "--clock"]), word=st.text("0123456789.-+_e auto", max_size=18))
-def test_numbers_and_choices_mean_what_typer_makes_of_them(option: str, word: str) -> None:
+def test_numbers_and_choices_are_parsed_as_by_typer(option: str, word: str) -> None:
     plain, checked = both([f"{option}={word}"])
 
     assert repr(plain) == repr(checked)
@@ -103,7 +103,7 @@ def test_all_commands_are_listed_without_making_one() -> None:
 
 
 @pytest.mark.parametrize("words", [["list"], ["echo", "a/b", "-n", "3"], ["hz", "--seconds", "2.5"]])
-def test_what_follows_a_graph_does_not_wait_for_pydantic_or_other_commands(words: list[str]) -> None:
+def test_client_commands_import_neither_pydantic_nor_other_commands(words: list[str]) -> None:
     code = (
         "import sys, typer; from dataflow.cli.main import app; import dataflow.client.attach\n"
         "group = typer.main.get_command(app)\n"

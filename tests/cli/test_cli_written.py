@@ -86,7 +86,7 @@ def test_a_merge_passes_over_parts_that_are_empty(dataflow, recorded: Recorded, 
     assert "nothing is in any of these files" in nothing.stderr
 
 
-def test_what_to_write_is_named_by_out_in_every_command(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+def test_every_command_names_its_output_by_out(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     dataflow("convert", recorded[0], "--to", "csv", "--stream", "left/fast", "-o", tmp_path / "csv")
     dataflow("convert", recorded[0], tmp_path / "former", "--to", "csv", "--stream", "left/fast")
     dataflow("view", recorded[0], "--out", tmp_path / "a.rrd")
@@ -99,7 +99,7 @@ def test_what_to_write_is_named_by_out_in_every_command(dataflow, recorded: Reco
     assert all((tmp_path / name).stat().st_size for name in ("a.rrd", "former.rrd", "graphs/mine.yaml"))
 
 
-def test_what_to_write_is_named_once(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+def test_output_is_given_exactly_once(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     twice = dataflow("convert", recorded[0], tmp_path / "a", "--to", "csv", "-o", tmp_path / "b", code=2).stderr
     never = dataflow("convert", recorded[0], "--to", "csv", code=2).stderr
 

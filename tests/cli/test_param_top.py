@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from background_run import Background
+from attached_run import AttachedRun
 from prometheus_text import prometheus
 from span_collector import collector
 
@@ -34,7 +34,7 @@ operators:
 """
 
 
-class Tunable(Background):
+class Tunable(AttachedRun):
     """A live run in a process each, which is recorded."""
 
     def __init__(self, folder: Path) -> None:
@@ -134,7 +134,7 @@ def test_all_values_are_read_and_those_that_can_change_listed(dataflow) -> None:
         (["tuned.factor", "1", "--timeout", "0"], 2, "--timeout 0: expected seconds, more than 0"),
     ],
 )
-def test_what_cannot_be_set_is_refused_with_the_reason(dataflow, words: list[str], code: int, told: str) -> None:
+def test_invalid_parameter_value_is_refused_with_the_reason(dataflow, words: list[str], code: int, told: str) -> None:
     before = dataflow("param", "get", "tuned.factor").stdout
 
     assert told in " ".join(dataflow("param", "set", *words, code=code).stderr.split())
@@ -260,7 +260,7 @@ def test_top_reports_latency_of_every_path(dataflow) -> None:
 
 
 @pytest.mark.usefixtures("running")
-def test_health_names_what_is_wrong_and_has_an_exit_code_for_it(dataflow, tmp_path: Path) -> None:
+def test_unhealthy_graph_is_reported_with_reasons_and_exit_code(dataflow, tmp_path: Path) -> None:
     words = ["health", "--over", "0.5", "--free", "0", "--folder", tmp_path]
     assert dataflow(*words, "--losses", "1").stdout == "tunable is healthy: 4 operators\n"
 
@@ -292,7 +292,7 @@ def test_metrics_are_those_of_the_operators() -> None:
 
 
 @pytest.mark.long
-def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, alone: Tunable) -> None:
+def test_unresponsive_process_is_shown_until_it_resumes(dataflow, alone: Tunable) -> None:
     process = alone.process_of("tuned")
     process.send_signal(signal.SIGSTOP)
     try:

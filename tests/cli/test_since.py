@@ -42,15 +42,23 @@ def said(more: dict[str, Any], **of: Any) -> str:
             {"facts": (("python", "3.11", "3.12"),)},
             "changed since the recording: libraries or the machine",
         ),
-        ({"files_changed": ["a.npy"]}, {}, "changed since the recording: a file that it read"),
+        (
+            {"files_changed": ["a.npy"]},
+            {},
+            "changed since the recording: a file that it read; perhaps its code, of which the recording has no digests",
+        ),
+        (
+            {},
+            {"facts": (("python", "3.11", "3.12"),)},
+            "changed since the recording: libraries or the machine; perhaps its code, of which the recording has no",
+        ),
         ({"code_known": True}, {}, "its code, parameters, libraries and machine are as recorded"),
         ({}, {}, "its code, of which the recording has no digests"),
     ],
 )
-def test_the_report_names_what_changed_or_that_all_is_as_recorded(
-    of: dict[str, Any], more: dict[str, Any], sentence: str
-) -> None:
-    assert sentence in said(more, **of)
+def test_report_names_changes_or_none(of: dict[str, Any], more: dict[str, Any], sentence: str) -> None:
+    assert sentence in (told := said(more, **of))
+    assert ("no digests" in told) is not of.get("code_known", False)
 
 
 def test_unchanged_operator_is_reported_as_recorded() -> None:

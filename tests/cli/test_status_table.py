@@ -108,9 +108,7 @@ def test_timeouts_and_late_messages_are_no_drops() -> None:
         (0.1, 15.1, 0.1, "its process is busy with detector"),
     ],
 )
-def test_a_source_behind_the_clock_is_named_with_who_holds_it_up(
-    read: float, sent: float, cpu: float, told: str
-) -> None:
+def test_source_behind_the_clock_is_named_with_the_cause(read: float, sent: float, cpu: float, told: str) -> None:
     table = StatusTable(graph_with("camera", "detector"))
     table.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
     counts = {"camera": (20, 20, 0, round(cpu * 1e9), 2 * 10**9, 10**9), "detector": (9, 9, 0, 0, 2 * 10**9, 0)}

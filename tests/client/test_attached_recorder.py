@@ -49,7 +49,7 @@ def numbers(path: str) -> list[tuple[int, int]]:
         return [(m.incarnation, m.seq) for m in recording.messages(["test/smooth/mean"])]
 
 
-def test_what_was_missed_is_counted_by_numbers(graph: Graph, tmp_path: Path) -> None:
+def test_missed_messages_are_counted_by_sequence_number(graph: Graph, tmp_path: Path) -> None:
     with AttachedRecorder(tmp_path / "a.mcap", graph, ["test/smooth/mean"], metadata={}) as recorder:
         for seq in (5, 6, 9, 10):
             recorder.take(said(seq))
@@ -59,7 +59,7 @@ def test_what_was_missed_is_counted_by_numbers(graph: Graph, tmp_path: Path) -> 
     assert numbers(recorder.tally.files[0]) == [(0, 5), (0, 6), (0, 9), (0, 10), (1, 2)]
 
 
-def test_what_cannot_be_is_left_out_and_counted(graph: Graph, tmp_path: Path) -> None:
+def test_invalid_messages_are_left_out_and_counted(graph: Graph, tmp_path: Path) -> None:
     with AttachedRecorder(tmp_path / "a.mcap", graph, ["test/smooth/mean"], metadata={}) as recorder:
         recorder.take(said(5))
         recorder.take(said(5))  # twice
@@ -92,9 +92,7 @@ def test_split_files_hold_everything_once_and_static_messages_each(
             assert recording.counts("test/left/constant") == {0: 1}
 
 
-def test_a_static_message_that_is_larger_than_a_file_may_be_does_not_split_at_each_message(
-    graph: Graph, tmp_path: Path
-) -> None:
+def test_static_message_above_the_size_limit_does_not_split_at_every_message(graph: Graph, tmp_path: Path) -> None:
     streams = ["test/smooth/mean", "test/left/constant"]
     large = FeatureVector(stamp=0, vectors=np.random.default_rng(1).random((1, 2_000), np.float32), model="m")
     split = Splitting(size=2_000)

@@ -45,7 +45,7 @@ def bar(replay: Replay) -> ReplayBar:
     return ReplayBar(replay, replay.ask(None))
 
 
-def test_it_pauses_and_goes_on_without_changing_a_speed_that_was_not_touched(replay: Replay, bar: ReplayBar) -> None:
+def test_pause_and_resume_keep_the_speed(replay: Replay, bar: ReplayBar) -> None:
     assert bar.state() == (True, FIRST + 2 * 10**9, 1.0)
     assert bar.request(playing=False, speed=1.0, seek=None) is None
     assert bar.state()[0] is False
@@ -75,7 +75,7 @@ def test_keys_in_its_terminal_move_the_bar_too(replay: Replay, bar: ReplayBar) -
     assert bar.state() == (False, FIRST + 3 * 10**9, 4.0)
 
 
-def test_a_replay_that_does_not_answer_leaves_the_bar_where_it_is_and_is_said(replay: Replay, bar: ReplayBar) -> None:
+def test_unanswered_request_leaves_the_bar_unchanged_and_is_reported(replay: Replay, bar: ReplayBar) -> None:
     replay.busy = True
     bar.refresh()
     assert bar.request(playing=False, speed=1.0, seek=None) == "did not answer"

@@ -29,7 +29,7 @@ def test_requests_arrive_in_order_and_are_repeated_where_the_collector_asks_for_
     assert {(path, kind) for path, kind, _ in taken} == {("/v1/traces", "application/json")}
 
 
-def test_what_the_collector_refuses_is_lost_and_named() -> None:
+def test_spans_refused_by_the_collector_are_counted_as_lost() -> None:
     with collector([(400, ""), (200, '{"partialSuccess": {"rejectedSpans": "4"}}'), (200, "fine")]) as (url, taken):
         sent, lost, reason = outcome(to_collector(f"{url}/own/path"), 3)
     assert (sent, lost) == (16, 14)
@@ -62,6 +62,6 @@ def test_a_file_that_cannot_be_written_refuses() -> None:
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:4318", "file:///etc/passwd", "http://", "ftp://127.0.0.1/x"])
-def test_what_is_no_collector_is_refused(url: str) -> None:
+def test_malformed_collector_url_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match=r"no URL of a collector, such as http://127.0.0.1:4318/v1/traces"):
         to_collector(url)

@@ -341,7 +341,7 @@ def test_a_hit_count_counts_the_passes_of_a_call_forwards_and_back(
         assert float(client.value("value")) == values[-2]
 
 
-def test_passes_are_counted_on_where_breakpoints_are_set_anew(recorded: Run) -> None:
+def test_hit_counts_continue_when_breakpoints_are_set_again(recorded: Run) -> None:
     with editing(recorded, 1, stopOnEntry=False) as client:
         client.begin(ADDED, hitCondition="1")
         assert client.call() == 1

@@ -106,7 +106,7 @@ def test_state_after_a_call_is_that_before_the_next(kept: Recording, operator: s
         before = fired
 
 
-def test_no_call_continues_from_one_that_was_made_otherwise(kept: Recording) -> None:
+def test_modified_call_is_no_start_for_later_calls(kept: Recording) -> None:
     debugger = Debugger(kept, "smooth")
     debugger.goto(1)
 
@@ -377,7 +377,7 @@ def test_broken_source_leaves_the_old_one(added: Recording, tmp_path: Path) -> N
     assert debugger.again().same
 
 
-def test_a_condition_is_gone_to(added: Recording) -> None:
+def test_until_goes_to_the_call_that_meets_the_condition(added: Recording) -> None:
     debugger = Debugger(added, "adder")
     found = debugger.until(lambda fired: fired.outputs["total"].vectors.item() > 100)
     assert found is not None
@@ -617,7 +617,7 @@ def test_an_error_is_shown_with_its_line(added: Recording, tmp_path: Path) -> No
     assert fired.recorded_error is None
 
 
-def test_setup_that_fails_is_tried_anew(added: Recording, tmp_path: Path) -> None:
+def test_failed_setup_is_retried(added: Recording, tmp_path: Path) -> None:
     debugger = Debugger(added, "adder")
     debugger.goto(2)
     written(tmp_path, RIGHT, more_imports="def broken(self): raise OSError('no camera')")

@@ -16,7 +16,7 @@ Reduced = Callable[[Sequence[int], Callable[[Sequence[int]], bool]], Sequence[in
 
 
 @given(st.integers(0, 60), st.sets(st.integers(0, 59), max_size=6))
-def test_exactly_what_is_needed_is_left(length: int, needed: set[int]) -> None:
+def test_reduction_leaves_exactly_the_needed_items(length: int, needed: set[int]) -> None:
     needed = {item for item in needed if item < length}
     items = range(length)
 
@@ -43,7 +43,7 @@ def test_no_single_item_of_the_result_can_be_left_out(reduced: Reduced, items: l
 
 
 @given(st.integers(0, 400), st.sets(st.integers(0, 399), max_size=6))
-def test_bisection_finds_what_is_needed_by_few_questions(length: int, needed: set[int]) -> None:
+def test_bisection_finds_the_needed_items_in_few_queries(length: int, needed: set[int]) -> None:
     needed = {item for item in needed if item < length}
     asked = 0
 

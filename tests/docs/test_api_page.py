@@ -12,7 +12,7 @@ import dataflow.operator
 import dataflow.recording
 
 
-def test_the_page_is_what_the_docstrings_say(repository: Path) -> None:
+def test_api_page_matches_the_docstrings(repository: Path) -> None:
     page = (repository / "docs" / "api.md").read_text(encoding="utf-8")
 
     assert page == markdown(), "run: python tools/api_page.py > docs/api.md"

@@ -37,7 +37,7 @@ def faults(once: Callable[..., Path]) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_blocks_of_a_page_do_what_they_say(faults: dict[str, list[str]], page: str) -> None:
+def test_blocks_of_a_page_do_as_stated(faults: dict[str, list[str]], page: str) -> None:
     assert not faults[page], "\n".join(faults[page])
 
 
@@ -94,7 +94,7 @@ def test_blocks_are_read_with_line_language_mark_and_file() -> None:
     assert (second.line, second.file, second.below, second.mark) == (6, "b.py", True, "")
 
 
-def test_a_list_that_goes_on_is_not_code_by_indentation() -> None:
+def test_continued_list_is_no_indented_code() -> None:
     (block,) = indented("- one\n    two\n\ntext\n\n    rerun a\n    rerun b\n\nmore\n")
     assert (block.line, block.text) == (5, "rerun a\nrerun b\n")
 

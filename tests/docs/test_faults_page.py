@@ -14,10 +14,10 @@ from dataflow.graph import load_graph
 from dataflow.supervision.core.health import LEVELS
 
 SHOWN_BY = {
-    "an operator raises": "an_operator_that_raises_is_made_anew_in_the_same_process",
+    "an operator raises": "operator_that_raises_is_recreated_in_the_same_process",
     "a process crashes": """
-        a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on
-        a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost
+        crashed_process_is_replaced_while_the_rest_continues
+        frontier_from_a_successor_reveals_messages_lost_of_its_predecessor
         a_late_death_notice_does_not_affect_the_successor
     """,
     "the same operator fails again and again": "restarts_come_to_an_end_and_the_last_cause_is_named",
@@ -39,12 +39,12 @@ SHOWN_BY = {
     """,
     "an operator is slow": "slow_operator_drops_by_policy_without_delaying_others",
     "a process gives no sign of life (stopped, swapped out)": """
-        a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy
+        unresponsive_process_is_killed_and_restarted_by_its_policy
         stopped_consumer_is_not_waited_for_and_starts_a_new_backlog
-        what_did_not_reach_a_consumer_is_counted_against_it
+        gap_at_a_consumer_is_counted_as_its_drops
     """,
     "a process lives and takes no messages (a call that holds the interpreter)": """
-        a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted
+        stopped_consumer_delays_no_other_process_and_its_loss_is_counted
     """,
     "the whole run or its supervisor pauses (`docker pause`, a suspended laptop, heavy swapping)": """
         pause_of_supervisor_and_others_kills_and_blames_no_process
@@ -55,25 +55,25 @@ SHOWN_BY = {
     """,
     "several faults at random": "a_run_under_faults_of_every_kind_is_verified_in_the_other_placement",
     "a source crashes, or a live source raises (an unplugged camera)": """
-        a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is
-        a_source_that_raises_is_made_anew_in_the_same_process
+        crashed_source_is_restarted_at_the_current_time
+        source_that_raises_is_recreated_in_the_same_process
     """,
     "a source stops": """
         a_source_that_stops_is_an_event_in_the_diagnostics
         a_source_that_stops_holds_up_no_other
     """,
-    "nothing happens around the robot": "a_robot_at_which_nothing_happens_goes_on",
+    "nothing happens around the robot": "idle_robot_keeps_running",
     "a source is slower than the clock": """
         a_source_behind_the_clock_is_named_at_once_and_at_the_end
-        a_process_that_is_busy_is_named_as_what_holds_its_source_up
+        busy_process_is_named_as_the_cause_of_a_late_source
     """,
     "a source floods": "a_flood_is_dropped_where_it_is_too_much_and_counted",
     "a clock jumps back": """
-        a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told
-        a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
+        clock_jump_back_starts_an_incarnation_and_resets_operators
+        replay_after_a_clock_jump_back_drops_repeated_stamps_as_late
     """,
     "a clock jumps ahead": """
-        a_clock_that_jumps_ahead_goes_on_there
+        clock_jump_ahead_continues_the_incarnation
         a_source_whose_stamps_jumped_far_ahead_is_named
     """,
     "a message has a stamp in the past": """
@@ -84,8 +84,8 @@ SHOWN_BY = {
         a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable
         a_recording_that_may_not_grow_ends_the_run_and_stays_readable
     """,
-    "the recorder is killed": "a_recorder_that_is_killed_is_followed_by_another_and_the_run_goes_on",
-    "the recorder is stopped or slow": "only_operators_of_a_live_run_may_miss_what_they_do_not_take",
+    "the recorder is killed": "killed_recorder_is_replaced_and_the_run_continues",
+    "the recorder is stopped or slow": "only_links_to_operators_of_a_live_run_drop",
     "a viewer or `dataflow echo` dies or stops": """
         a_viewer_that_is_killed_is_not_missed
         a_stopped_viewer_costs_nothing_and_loses_nothing
@@ -96,7 +96,7 @@ SHOWN_BY = {
         forged_ends_frontiers_and_messages_change_nothing
     """,
     "an envelope contradicts its stream": """
-        a_well_formed_envelope_that_contradicts_its_stream_ends_nothing_and_changes_nothing
+        contradicting_envelope_is_ignored_and_counted
     """,
 }
 """The faults of the page, with the tests that show the response to each, without `test_`."""

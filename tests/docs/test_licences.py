@@ -95,7 +95,7 @@ def test_the_page_has_every_package_with_its_licence() -> None:
         ("Apache-2.0", False),
     ],
 )
-def test_the_gpl_is_told_from_the_lgpl(words: str, copyleft: bool) -> None:
+def test_gpl_is_distinguished_from_lgpl(words: str, copyleft: bool) -> None:
     assert bool(tool.COPYLEFT.search(words)) == copyleft
 
 
@@ -106,7 +106,7 @@ def test_evo_would_be_found() -> None:
     assert tool.COPYLEFT.search(tool.licence(found))
 
 
-def test_the_project_says_its_own_licence() -> None:
+def test_project_declares_its_licence() -> None:
     assert "Apache License" in (REPOSITORY / "LICENSE").read_text(encoding="utf-8")
     assert "the robot-dataflow authors" in (REPOSITORY / "NOTICE").read_text(encoding="utf-8")
     text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")

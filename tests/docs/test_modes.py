@@ -37,7 +37,7 @@ def functions(repository: Path) -> Iterator[tuple[str, str, ast.AST]]:
                     yield path.relative_to(repository).as_posix(), node.name, node
 
 
-def test_nobody_asks_what_class_decides_firings_or_feeds_them(repository: Path) -> None:
+def test_no_function_checks_the_class_of_runners_or_feeds(repository: Path) -> None:
     asked = [
         f"{file}: {ast.unparse(call)}"
         for file, _, function in functions(repository)

@@ -76,9 +76,7 @@ def test_leaves_a_process_in_a_session():
 
 
 @pytest.mark.long
-def test_a_mutant_is_killed_survives_or_is_not_run_and_no_process_of_the_tests_is_left(
-    tmp_path: Path, repository: Path
-) -> None:
+def test_mutant_verdicts_leave_no_test_process_behind(tmp_path: Path, repository: Path) -> None:
     for file, text in {
         "dataflow/toy/a.py": PACKAGE,
         "tests/toy/test_a.py": TESTS.replace("PLACE", f"{tmp_path}/left"),

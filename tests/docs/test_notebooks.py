@@ -77,7 +77,7 @@ def test_the_tour_has_twenty_cells_without_outputs() -> None:
         (18, ["<b>identical</b>", "1,001 messages"]),
     ],
 )
-def test_cells_show_what_they_say(shown: list[str], cell: int, words: list[str]) -> None:
+def test_notebook_cells_show_the_stated_output(shown: list[str], cell: int, words: list[str]) -> None:
     assert len(shown) == 20
     for word in words:
         assert word in shown[cell]

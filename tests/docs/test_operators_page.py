@@ -24,7 +24,7 @@ def page(repository: Path) -> str:
     return (repository / "docs" / "operators.md").read_text(encoding="utf-8")
 
 
-def test_the_page_is_what_the_operators_declare(found: Catalogue, page: str) -> None:
+def test_operators_page_matches_the_declarations(found: Catalogue, page: str) -> None:
     if not found.failures:
         assert page == markdown(found), REMEDY
     for use, cls in found.operators.items():  # where an optional package is missing, what can be imported

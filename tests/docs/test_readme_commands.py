@@ -40,7 +40,7 @@ def test_streams_that_are_followed_belong_to_the_graph_that_was_started(quoted: 
     assert followed
 
 
-def test_every_extra_has_a_row_that_says_what_it_brings(repository: Path) -> None:
+def test_every_extra_has_a_row_on_the_installing_page(repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     page = (repository / "docs" / "installing.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `\[(\w+)\]` \|", page, re.MULTILINE)

@@ -48,6 +48,6 @@ def test_every_message_is_one_of_the_program(repository: Path, texts: str) -> No
     assert not unknown, f"docs/troubleshooting.md explains what nobody says: {unknown}"
 
 
-def test_a_message_that_nobody_prints_is_found(texts: str) -> None:
+def test_quoted_message_absent_from_the_source_is_found(texts: str) -> None:
     assert said("no graph runs on this machine", texts)
     assert not said("the flux capacitor is empty", texts)

@@ -13,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 import dataflow
+from dataflow.cli import plugins
 from dataflow.cli.main import app
-from dataflow.cli.support import plugins
 from dataflow.graph import GraphError, load_text
 from dataflow.messages import Number, Odometry, Point
 from dataflow.testing import play

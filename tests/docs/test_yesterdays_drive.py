@@ -15,7 +15,7 @@ FAILS = ("# fails", "# finds a difference")
 
 
 @pytest.mark.long
-def test_every_block_does_what_the_page_says(repository: Path, tmp_path: Path) -> None:
+def test_every_block_of_the_page_runs_and_prints_as_shown(repository: Path, tmp_path: Path) -> None:
     page = (repository / "docs" / "yesterdays-drive.md").read_text(encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "200"}

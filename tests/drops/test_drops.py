@@ -156,7 +156,7 @@ def test_unknown_functions_are_refused() -> None:
         ("1 > 0", "no figure ; there are"),
     ],
 )
-def test_what_cannot_be_found_is_refused(run: Path, worse: str, problem: str) -> None:
+def test_unmet_or_unknown_drop_condition_is_refused(run: Path, worse: str, problem: str) -> None:
     with pytest.raises(DropsError) as caught:
         cost(run, worse)
 

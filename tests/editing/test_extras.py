@@ -201,7 +201,7 @@ ITEMS = st.lists(st.tuples(st.sampled_from(["a", "b", "x/a", "y/a", "x/a 2"]), s
 
 
 @given(st.lists(st.tuples(st.sampled_from("xyz"), ITEMS), max_size=4))
-def test_nothing_is_lost_and_no_name_of_a_file_means_what_another_files_does(
+def test_merged_attachments_keep_all_contents_under_unique_names(
     files: list[tuple[str, list[tuple[str, int]]]],
 ) -> None:
     found = names_once(files)

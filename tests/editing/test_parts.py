@@ -44,7 +44,7 @@ def test_a_part_holds_the_span_byte_for_byte(recorded: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_a_replay_of_a_part_makes_what_the_whole_one_makes_there(stateful: Path, tmp_path: Path) -> None:
+def test_replay_of_a_part_equals_that_of_the_whole(stateful: Path, tmp_path: Path) -> None:
     part = cut(stateful, tmp_path / "part.mcap", 0.5, 0.8)
 
     again, there = tmp_path / "again.mcap", tmp_path / "there.mcap"

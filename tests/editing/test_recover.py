@@ -107,7 +107,7 @@ def test_a_time_before_the_epoch_is_saved_as_it_is(tmp_path: Path) -> None:
         assert [raw.log_time for raw in recording.raw()] == [-(2**63), -1, 5]
 
 
-def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+def test_recovering_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"nothing of the kind")
     with pytest.raises(RecordingError, match="not an MCAP file: it begins with 6e 6f"):
         recover(tmp_path / "a.mcap", tmp_path / "saved.mcap")

@@ -98,7 +98,7 @@ def test_folders_and_repositories_are_locked_by_where_they_are_from() -> None:
     assert pin(whole, direct=False) == ("tiny==1.0", {"cd"})
 
 
-def test_a_build_that_fails_leaves_the_environment_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_build_leaves_the_environment_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     requirements, folder = tmp_path / "gains.txt", tmp_path / "gains.env"
     requirements.write_text("tiny\n")
 

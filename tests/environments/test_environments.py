@@ -95,7 +95,7 @@ def test_the_standard_library_of_this_installation_is_not_that_of_an_environment
     assert sysconfig.get_path("purelib") in path
 
 
-def test_a_verification_repeats_each_operator_in_its_environment_and_names_other_versions(
+def test_verification_runs_operators_in_their_environments_and_names_other_versions(
     recorded: Path, environments: Path
 ) -> None:
     report = verify(recorded)
@@ -126,7 +126,7 @@ def thin(environments: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unverifiable(thin: Path) -> None:
+def test_operator_in_another_environment_than_its_producer_is_unverifiable(thin: Path) -> None:
     report = verify(thin)
 
     assert {v.operator: (v.verdict, v.missing) for v in report.operators} == {
@@ -137,9 +137,7 @@ def test_an_operator_that_only_one_process_could_repeat_with_its_maker_is_unveri
         verify(thin, only=["second"])
 
 
-def test_an_operator_whose_environment_is_not_here_stops_the_verification_of_no_other(
-    recorded: Path, environments: Path
-) -> None:
+def test_missing_environment_does_not_stop_the_verification_of_others(recorded: Path, environments: Path) -> None:
     (environments / "two").rename(environments / "away")
     try:
         report = verify(recorded)
@@ -181,7 +179,7 @@ def test_the_debugger_begins_in_the_environment_of_its_operator(operator: str, r
 
 
 @pytest.mark.long
-def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs_there(
+def test_call_is_captured_and_tested_in_the_environment_of_its_operator(
     recorded: Path, environments: Path, tmp_path: Path
 ) -> None:
     with other_version(environments):
@@ -193,7 +191,7 @@ def test_a_call_is_captured_in_the_environment_of_its_operator_and_its_test_runs
 
 
 @pytest.mark.long
-def test_what_decided_a_value_is_found_in_the_environment_of_its_operators(recorded: Path, tmp_path: Path) -> None:
+def test_blame_runs_in_the_environment_of_its_operators(recorded: Path, tmp_path: Path) -> None:
     told = command("blame", str(recorded), "--field", "first/y.vectors@0.01", folder=tmp_path)
     assert told.returncode == 0, told.stderr
     assert "first #10" in told.stdout
@@ -253,9 +251,7 @@ def test_a_fix_is_proven_by_calls_in_the_environment_of_its_operator(recorded: P
         answer("prove", {**asked, "expect": "1 = 2"}, said.append)
 
 
-def test_another_operator_is_judged_although_its_recorded_code_cannot_be_tried_here(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_operator_is_judged_without_its_recorded_code(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Difference(4, "fire", 0, "y", "aa", "bb")
     second = Verification("second", 20, 20, first=first, own_fault=True, code_changed=["env_operators"])
     report = VerifyReport((second,), (), (), 0, 0, 0.0, 0.0, repeated={"second": True})
@@ -272,7 +268,7 @@ def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> N
         place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
 
 
-def test_a_chain_that_begins_in_an_environment_and_ends_outside_is_refused_with_what_may_be_asked(
+def test_chain_leaving_its_environment_is_refused_with_the_askable_part(
     environments: Path,
 ) -> None:
     text = TEXT.format(folder=environments, record="all").replace(f", env: {environments}/two", "")
@@ -310,7 +306,7 @@ def test_an_environment_is_asked_once_until_it_changes(tmp_path: Path) -> None:
     assert asked() == 2
 
 
-def test_an_environment_that_cannot_serve_is_refused_with_what_would_be_right(tmp_path: Path) -> None:
+def test_unusable_environment_is_refused_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(EnvError, match=r"no environment: .*bin/python is missing; `.* -m venv .*none` makes one"):
         environment_of(str(tmp_path / "none"))
 

@@ -7,7 +7,7 @@ from dataflow.execution.clock_correction import ClockCorrection
 SECOND = 1_000_000_000
 
 
-def test_stamps_stay_until_an_offset_is_measured_and_are_then_those_of_the_supervisor() -> None:
+def test_stamps_are_shifted_once_the_clock_offset_is_measured() -> None:
     clock = ClockCorrection()
     assert clock.shift(5 * SECOND) == 0
 

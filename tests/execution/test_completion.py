@@ -124,7 +124,7 @@ IMAGES = [Image(stamp=t, frame="c", data=np.zeros((2, 2), np.uint8)) for t in (5
         (Closing(), {"number": [Number(stamp=1, value=0)]}, r"finish\(\) has no anchor"),
     ],
 )
-def test_a_frame_that_nothing_gives_is_an_error_that_says_why(
+def test_undeterminable_frame_is_an_error_with_its_reason(
     operator: Operator, streams: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(OperatorFailure, match=rf"emitted Point without frame, and .*{why}.*; give frame="):
@@ -209,7 +209,7 @@ class Fixed(Operator):
         (Fixed(), r"Fixed\.alarm emitted Alarm without stamp: static_outputs\(\) is no firing .*give stamp="),
     ],
 )
-def test_what_no_firing_makes_gives_its_stamp_and_frame(operator: Operator, message: str) -> None:
+def test_messages_emitted_outside_firings_need_stamp_and_frame(operator: Operator, message: str) -> None:
     with pytest.raises(OperatorFailure, match=message):
         play(operator, None if isinstance(operator, Source) else {"number": [Number(stamp=1, value=0)]})
 

@@ -85,7 +85,7 @@ def test_a_step_of_the_feeds_is_worked_through_before_the_next_is_given() -> Non
     assert all(runner.ended for runner in driver.operators)
 
 
-def test_feeds_wait_for_what_has_arrived_meanwhile() -> None:
+def test_feeds_wait_for_arrived_messages() -> None:
     arrived = [True]
     driver = Driver(Feeding(), lambda: arrived[0])
     chain(driver, "a")

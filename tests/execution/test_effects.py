@@ -121,7 +121,7 @@ def test_recorded_answers_are_given_again_without_a_call() -> None:
     assert next(WORLD) == before + 1
 
 
-def test_numbers_drawn_behind_a_call_do_not_depend_on_what_it_drew() -> None:
+def test_random_draws_after_an_effect_are_independent_of_it() -> None:
     ran = recorded(lambda operator, x: operator.effect(ask) + random.random() + operator.rng.random())
 
     assert again(ran).result.verdict == "identical"
@@ -221,7 +221,7 @@ def test_a_prompt_that_a_call_sees_besides_its_arguments_is_a_miss_where_it_chan
     assert f"{place} differs from the recorded call" in found.got
 
 
-def test_what_a_call_changes_in_its_object_and_credentials_are_no_miss() -> None:
+def test_effect_key_ignores_object_state_and_credentials() -> None:
     def body(token: str) -> Body:
         clients: list[Client] = []
 
@@ -342,7 +342,7 @@ GRID = np.arange(6, dtype=np.float32).reshape(2, 3)
 @pytest.mark.parametrize(
     "other", [GRID.reshape(3, 2), GRID.astype(np.float64), GRID.T.copy(), GRID + 1, GRID.tolist(), GRID[:0]]
 )
-def test_arrays_are_told_apart_by_type_shape_and_values(other: Any) -> None:
+def test_array_keys_differ_by_type_shape_and_values(other: Any) -> None:
     def key(value: Any) -> Key:
         return Key.of(ask, (value,), {})
 
@@ -358,7 +358,7 @@ def test_calls_may_be_left_out_or_made_in_another_order() -> None:
     assert swapped.result.verdict == "identical"
 
 
-def test_answers_are_in_the_run_what_they_are_in_a_re_execution() -> None:
+def test_effect_answers_are_equal_in_run_and_reexecution() -> None:
     seen: list[Any] = []
     given = {"list": (1, [2.5, None]), "array": np.arange(6, dtype=np.int16).reshape(2, 3), "bytes": b"\x00"}
 
@@ -521,7 +521,7 @@ def test_the_answers_of_one_firing_are_bounded_together() -> None:
     assert again(recorded(tries)).result.verdict == "identical"
 
 
-def test_what_has_no_key_or_no_firing_is_refused() -> None:
+def test_effects_without_key_or_firing_are_refused() -> None:
     def tries(operator: Asking, x: FeatureVector) -> float:
         with pytest.raises(EffectError, match="a call is known by its name"):
             operator.effect(lambda: 1)

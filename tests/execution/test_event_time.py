@@ -36,7 +36,7 @@ def test_event_time_is_the_clocks_and_not_before_a_stamp_that_was_seen() -> None
     assert time.now() == 101 * S
 
 
-def test_what_is_left_until_a_stamp_passes_with_the_clock_though_event_time_stands_still() -> None:
+def test_time_until_a_stamp_shrinks_by_the_clock_while_event_time_stands() -> None:
     clock = Clock()
     time = EventTime(clock.event)
     time.see(clock.ns + 500 * MS)
@@ -61,7 +61,7 @@ def test_a_first_message_that_was_held_up_does_not_put_event_time_back(off: int)
     assert time.until(clock.ns + off + 5) == 5
 
 
-def test_a_decision_is_waited_for_no_longer_than_said_after_a_first_message_that_was_held_up() -> None:
+def test_wait_after_a_delayed_first_message_is_within_the_timeout() -> None:
     """As after a freeze: what was sent meanwhile arrives at once, and one stream goes on while the other is away."""
     clock = Clock()
     runner = LiveRunner(

@@ -18,7 +18,7 @@ from dataflow.recording import Recorded
 from dataflow.sync import FOREVER, Entry
 
 
-def test_a_window_is_full_by_messages_or_bytes_and_empties_with_what_is_done() -> None:
+def test_window_fills_by_messages_or_bytes_and_empties_when_covered() -> None:
     window = Window(3, 100)
     window.add(1, 2, 10)
     assert not window.full
@@ -39,7 +39,7 @@ def test_a_window_is_full_by_messages_or_bytes_and_empties_with_what_is_done() -
     assert not window.full
 
 
-def test_event_time_goes_on_at_its_rate_and_from_where_it_was_put(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_event_time_advances_at_its_rate_from_its_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=50.0)
     fake = SimpleNamespace(time=lambda: clock.now, time_ns=lambda: round(clock.now * 1e9))
     monkeypatch.setattr("dataflow.execution.feeds.pace.time", fake)
@@ -171,7 +171,7 @@ def test_a_feed_that_is_ended_early_ends_its_streams_where_it_was() -> None:
     assert [(r.kind, r.operator) for r in told.records if r.kind == "finish"] == [("finish", "m"), ("finish", "s")]
 
 
-def test_a_stream_whose_clock_went_back_ends_behind_its_last_message_though_it_was_further_before() -> None:
+def test_stream_whose_clock_went_back_ends_after_its_last_message() -> None:
     log, told = feed(Played((X, 50, 0), (X, 10, 1), (Y, 60, 0), (X, 70, 1), static=MAP))
 
     given_whole(log)

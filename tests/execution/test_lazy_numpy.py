@@ -95,7 +95,7 @@ def plain(value: Any) -> str:
 
 
 @pytest.mark.parametrize("use", USES)
-def test_what_is_drawn_is_the_same(use: str) -> None:
+def test_lazy_seeding_draws_the_same_numbers(use: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         np.random.seed(7)
@@ -110,7 +110,7 @@ def test_what_is_drawn_is_the_same(use: str) -> None:
         assert (plain(USES[use]()), np.random.normal(size=700).tolist()) == expected
 
 
-def test_a_draw_after_a_draw_is_seeded_anew() -> None:
+def test_seed_after_a_draw_repeats_the_draws() -> None:
     drawn = []
     for _ in range(2):
         seed_lazily(3)
@@ -146,7 +146,7 @@ def test_looking_at_the_generator_does_not_draw() -> None:
     assert peek() != before
 
 
-def test_looking_at_the_generator_tells_of_as_many_draws_as_bring_it_back_to_its_place() -> None:
+def test_peek_detects_draws_that_return_the_generator_to_its_position() -> None:
     seed_lazily(3)
     np.random.bytes(4 * 624)
     before = peek()

@@ -71,7 +71,7 @@ def _lazy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_lazy")
 @pytest.mark.parametrize("use", USES)
-def test_what_is_drawn_is_the_same(use: str) -> None:
+def test_lazy_seeding_draws_the_same_numbers(use: str) -> None:
     for seed in (0, 2**63 - 1):
         random.seed(7)
         random.gauss(0, 1)  # leaves a second number behind, which seeding has to forget
@@ -86,7 +86,7 @@ def test_what_is_drawn_is_the_same(use: str) -> None:
 
 
 @pytest.mark.usefixtures("_lazy")
-def test_a_draw_after_a_draw_is_seeded_anew() -> None:
+def test_seed_after_a_draw_repeats_the_draws() -> None:
     drawn = []
     for _ in range(2):
         seed_lazily(3)

@@ -47,7 +47,7 @@ def test_a_static_trigger_of_a_merge_is_waited_for_without_working() -> None:
     assert not runner.timeouts
 
 
-def test_a_wait_that_is_given_up_is_no_drop_and_what_comes_late_is_counted() -> None:
+def test_timeout_is_no_drop_and_late_messages_are_counted() -> None:
     runner, _collector = live(node(Either, {"a": ["t/s/a"], "b": ["t/s/b"]}))
 
     runner.push("t/s/a", entry("t/s/a", 100, 0))
@@ -121,7 +121,7 @@ def test_a_second_jump_resets_again() -> None:
     assert runner.operator.resets == 2
 
 
-def test_after_a_jump_an_ended_stream_is_not_waited_for_and_one_that_begins_again_is_taken() -> None:
+def test_clock_jump_restarts_ended_streams_without_waiting_for_absent_ones() -> None:
     runner, collector = live(node(Pair, {"a": ["t/s/a"], "b": ["t/s/b"]}, Live("block", 16, {"a": None, "b": None})))
     for stream in ("t/s/a", "t/s/b"):
         runner.push(stream, entry(stream, 1000, 0))
@@ -135,7 +135,7 @@ def test_after_a_jump_an_ended_stream_is_not_waited_for_and_one_that_begins_agai
     assert [r.stamp for r in collector.records if r.kind == "fire"] == [1000, 500]
 
 
-def test_after_a_jump_a_static_stream_that_ended_without_its_message_is_not_waited_for() -> None:
+def test_ended_static_stream_is_not_waited_for_after_a_clock_jump() -> None:
     runner, collector = live(node(Either, {"a": ["t/s/a"], "b": ["t/m/b"]}), static=frozenset({"t/m/b"}))
     runner.end("t/m/b", None, "its source has none")
     for stamp, incarnation in ((1000, 0), (500, 1)):
@@ -146,7 +146,7 @@ def test_after_a_jump_a_static_stream_that_ended_without_its_message_is_not_wait
 
 
 @pytest.mark.parametrize("queue", ["newest", "block"])
-def test_what_breaks_the_promise_of_its_stream_is_refused_and_the_run_goes_on(queue: Any) -> None:
+def test_messages_behind_a_frontier_are_refused_and_the_run_continues(queue: Any) -> None:
     inputs = {"x": ["t/s/x"], "rest": ["t/s/rest"]}
     runner, collector = live(node(Gathers, inputs, Live(queue, 16, {"x": 0, "rest": 0})))
     for stream in ("t/s/x", "t/s/rest"):
@@ -176,7 +176,7 @@ def test_an_operator_that_never_fires_keeps_a_bounded_number_of_drops() -> None:
     assert more == {("a", "overflow"): 9_999 - 4_096}
 
 
-def test_a_record_says_how_many_drops_it_does_not_list() -> None:
+def test_record_counts_its_unlisted_drops() -> None:
     runner, collector = live(node(Echo, {"x": ["t/s/x"]}, Live("newest", 1, {"x": 0})))
 
     for seq in range(5_000):
@@ -202,7 +202,7 @@ def fired(collector: Collector) -> list[int]:
     return [r.stamp for r in collector.records if r.kind == "fire"]
 
 
-def test_an_operator_that_samples_itself_fires_at_once_when_its_own_promise_decides() -> None:
+def test_self_sampling_operator_fires_once_its_frontier_decides() -> None:
     waits = {"x": None, "last": None, "rest": None}
     runner, collector, ready = looped(queue="newest", size=16, wait=waits)
     runner.advance("t/s/rest", 1_000)
@@ -215,7 +215,7 @@ def test_an_operator_that_samples_itself_fires_at_once_when_its_own_promise_deci
     assert collector.numbers == [1.0, 3.0, 6.0]
 
 
-def test_an_operator_that_samples_itself_makes_all_firings_that_follow_from_its_own_messages() -> None:
+def test_self_sampling_operator_makes_all_firings_of_its_messages() -> None:
     """Every call decides the next one by what it gives to itself; nothing else arrives."""
     waits = {"x": None, "last": None, "rest": None}
     runner, collector, ready = looped(queue="block", size=16, wait=waits)

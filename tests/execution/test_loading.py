@@ -122,7 +122,7 @@ def test_a_library_that_a_thread_of_the_call_loads_is_seeded(modules: Path) -> N
     assert made(in_a_thread) == made(open3d_seed)
 
 
-def test_generators_of_gpus_are_seeded_when_a_call_initialises_them_and_in_each_call_after(modules: Path) -> None:
+def test_gpu_generators_are_seeded_on_initialisation_and_at_each_call(modules: Path) -> None:
     def seeds(k: int) -> float:
         torch: Any = importlib.import_module("torch")
         if not torch.cuda.is_initialized():
@@ -137,7 +137,7 @@ def test_generators_of_gpus_are_seeded_when_a_call_initialises_them_and_in_each_
 
 
 @pytest.mark.parametrize("before", [0, 2], ids=["nothing drawn before", "drawn before"])
-def test_what_a_module_draws_or_seeds_while_it_is_loaded_is_taken_back(modules: Path, before: int) -> None:
+def test_random_draws_during_import_are_undone(modules: Path, before: int) -> None:
     def draws() -> float:
         for _ in range(before):
             random.random(), np.random.random()
@@ -161,7 +161,7 @@ def test_a_module_that_fails_to_load_leaves_the_generators_as_they_were(modules:
     assert made(draws) == made(random.random)
 
 
-def test_what_is_loaded_outside_of_calls_is_left_alone(modules: Path) -> None:
+def test_modules_imported_outside_of_calls_are_left_alone(modules: Path) -> None:
     made(random.random)
     random.seed(5)
     import drawing  # noqa: F401

@@ -34,7 +34,7 @@ def test_numbers_of_an_incarnation_follow_each_other(left: list[tuple[int, int]]
             assert taken == list(range(begin, begin + len(taken)))
 
 
-def test_a_message_that_goes_on_is_the_recorded_one() -> None:
+def test_gapless_numbering_returns_the_recorded_messages() -> None:
     items = [recorded("left", 0, seq) for seq in range(7, 12)]
 
     assert all(mine is theirs for mine, theirs in zip(gapless(items), items, strict=True))

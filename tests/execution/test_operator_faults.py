@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from firing_operators import Collector, Echo, entry, node, run_all
 
 from dataflow.chaos.faults import HANG, OperatorFaults
@@ -12,6 +15,7 @@ from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.live import LiveRunner
 from dataflow.graph.model import Live, Restart
 from dataflow.messages import FeatureVector
+from dataflow.supervision.process_main import _report
 from dataflow.sync import Firing
 
 
@@ -39,7 +43,7 @@ class Crashing(Echo):
         return x
 
 
-def test_a_failure_that_is_outlived_says_the_operators_own_line() -> None:
+def test_survived_failure_names_the_line_of_the_operator() -> None:
     made = node(Crashing, {"x": ["t/s/x"]}, Live("newest", 16, {"x": 0}, restart=Restart(max=1, backoff=0)))
     told: list[OperatorFailure] = []
     runner = LiveRunner(
@@ -85,3 +89,32 @@ def test_a_planned_error_spares_the_finish() -> None:
 
     assert faults.before(Firing(0, "finish")) is None
     assert faults.before(Firing(0, "fire")) is not None
+
+
+class Importing(Echo):
+    """Needs a package of an extra."""
+
+    def setup(self) -> None:
+        import cv2  # noqa: F401
+
+
+def test_missing_package_of_an_extra_is_named_with_its_extra_but_recorded_as_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    made = node(Importing, {"x": ["t/s/x"]}, Live("newest", 16, {"x": 0}))
+    runner = LiveRunner(made, Collector(), static=frozenset(), operator=Importing(), event_clock=lambda: 0)
+    reported: list[str] = []
+    with pytest.raises(OperatorFailure, match=r"halted.*; it comes with: pip install 'robot-dataflow\[") as caught:
+        runner.setup()
+    _report(SimpleNamespace(send=lambda kind, **fields: reported.append(fields["summary"])), caught.value, "setup")
+
+    assert str(caught.value).endswith(reported[0])
+    assert "pip install" not in caught.value.summary
+
+
+def test_hint_that_an_error_gives_itself_is_not_repeated() -> None:
+    error = ImportError("no rays; it comes with: pip install 'robot-dataflow[sim]', but not everywhere")
+    error.__cause__ = ModuleNotFoundError("No module named 'open3d'", name="open3d")
+
+    assert str(OperatorFailure("robot", "setup()", error)).count("pip install") == 1

@@ -17,7 +17,7 @@ from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, KeyBindings
 from dataflow.execution.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
-def test_paused_holds_everything_until_it_goes_on() -> None:
+def test_pause_holds_playback_until_resumed() -> None:
     playback = Playback(paused=True)
     assert playback.holds
     playback.do("toggle")
@@ -91,7 +91,7 @@ def test_an_unknown_action_is_refused() -> None:
         (b"x n", ["toggle", "step"]),
     ],
 )
-def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
+def test_keys_match_the_help_text(typed: bytes, meant: list[str]) -> None:
     assert list(pressed(typed)) == meant
 
 
@@ -104,8 +104,11 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     ],
     ids=["flight recorder", "no flight recorder", "live"],
 )
-def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, offers: tuple[KeyBindings, ...], meant: list[str]
+def test_terminal_keys_control_playback_and_restore_the_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    offers: tuple[KeyBindings, ...],
+    meant: list[str],
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []
@@ -133,6 +136,8 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
 
     assert done == meant
     assert after == before
+    told = " ".join(capsys.readouterr().err.split())
+    assert ("k: save the history" in told) is (KEEPING in offers)
 
 
 def test_a_job_in_the_background_reads_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:

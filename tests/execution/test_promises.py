@@ -31,7 +31,7 @@ def test_no_message_of_the_same_incarnation_lies_within_a_promise(incarnations: 
         before += len(part)
 
 
-def test_a_stream_that_never_went_back_is_promised_up_to_its_next_message_and_without_limit_after_the_last() -> None:
+def test_monotonic_stream_is_promised_up_to_its_next_message() -> None:
     assert promises([3, 5, 9]) == [2, 4, 8, FOREVER]
 
 

@@ -200,7 +200,7 @@ def test_generators_are_as_they_were_for_setup_and_firings() -> None:
         assert (calls.operator.total, random.random()) == (0.32187845154943107, 0.9575942977611154)
 
 
-def test_a_difference_after_an_input_without_a_recorded_digest_is_not_the_operators_own() -> None:
+def test_difference_after_an_input_without_digest_is_not_attributed_to_the_operator() -> None:
     """A producer whose log is torn: nobody knows whether this message is the recorded one."""
     made = node(Echo, {"x": [STREAM]}, Live("block", 16, {"x": 0}))
     messages = [entry(STREAM, 100, 0), entry(STREAM, 200, 1)]

@@ -150,7 +150,7 @@ def _fire(runner: LiveRunner, stamp: int) -> None:
         ("sum_to_reload", CODE + "\n    def setup(self):\n        while True: pass\n", r"not over within 0\.05 s"),
     ],
 )
-def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
+def test_unfit_reloaded_code_is_refused_and_the_old_continues(
     folder: Path,
     running: tuple[LiveRunner, Collector],
     module: str,
@@ -173,7 +173,7 @@ def test_code_that_does_not_fit_is_refused_and_the_old_one_goes_on(
     assert not store().exists()
 
 
-def test_a_reload_says_whether_the_code_has_changed(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
+def test_reload_reports_whether_the_code_changed(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
     runner, _ = running
     assert not runner.reload()["changed"]
     (folder / "step_of_reload.py").write_text("STEP = 20\n")
@@ -192,9 +192,7 @@ def test_a_module_that_declares_messages_is_not_imported_again(
         runner.reload()
 
 
-def test_a_state_that_the_new_code_does_not_take_is_begun_anew(
-    folder: Path, running: tuple[LiveRunner, Collector]
-) -> None:
+def test_state_unfit_for_reloaded_code_is_reset(folder: Path, running: tuple[LiveRunner, Collector]) -> None:
     runner, collector = running
     (folder / "sum_to_reload.py").write_text(CODE.replace("total", "sum_so_far"))
 
@@ -206,7 +204,7 @@ def test_a_state_that_the_new_code_does_not_take_is_begun_anew(
     assert collector.kinds() == ["setup", "fire", "setup", "fire"]
 
 
-def test_an_operator_that_has_failed_goes_on_with_new_code_at_once(
+def test_failed_operator_resumes_at_once_with_reloaded_code(
     folder: Path, running: tuple[LiveRunner, Collector]
 ) -> None:
     runner, collector = running

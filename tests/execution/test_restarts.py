@@ -25,7 +25,7 @@ def policy(most: int, backoff: float = 0.1) -> tuple[Restarts, Clock]:
 
 
 @given(st.integers(0, 20))
-def test_there_are_as_many_attempts_as_the_policy_says(most: int) -> None:
+def test_number_of_attempts_is_that_of_the_policy(most: int) -> None:
     restarts, clock = policy(most)
 
     outlived = 0

@@ -55,7 +55,7 @@ def test_an_operator_does_not_notice_a_source_that_draws() -> None:
     assert beside(drawing=True) == beside(drawing=False)
 
 
-def test_what_a_source_draws_does_not_depend_on_the_operators_beside_it() -> None:
+def test_random_draws_of_a_source_are_independent_of_other_operators() -> None:
     def draws(disturb: bool) -> list[float]:
         runner, collector = source()
         while runner.look_ahead() is not None:

@@ -46,7 +46,7 @@ class Clocks:
         return self.cpu
 
 
-def test_short_calls_are_added_up_and_one_that_waited_counts_what_it_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_adds_short_calls_and_excludes_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks = Clocks()
     monkeypatch.setattr("dataflow.execution.work.time", clocks)
     work = Work()

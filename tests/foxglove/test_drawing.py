@@ -82,7 +82,7 @@ def tracks(**fields):
     )  # fmt: skip
 
 
-def test_tracks_are_drawn_in_space_where_they_have_positions_and_else_over_the_image():
+def test_tracks_are_drawn_at_their_positions_or_over_the_image():
     boxes = np.array([[1, 2, 3, 4], [np.nan] * 4], np.float32)
     positions = np.array([[1.0, 2.0, 0.5], [np.nan] * 3])
     over = decoded(tracks(boxes=boxes))

@@ -70,7 +70,7 @@ def test_everything_is_shown_once_in_the_order_of_its_stamps_static_streams_firs
     assert shown[-1] == "end"
 
 
-def test_a_jump_shows_what_was_last_there_and_goes_on_from_it(recording: Recording) -> None:
+def test_seek_shows_the_latest_messages_and_continues(recording: Recording) -> None:
     shown = played(recording, Clock(10 * SECOND, 19 * SECOND, speed=1e6), {"fast 17": "seek 13", "end": "close"})
 
     there = shown.index("fast 17") + 1

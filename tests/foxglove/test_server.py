@@ -104,9 +104,7 @@ def found(seq: int) -> Detections2D:
     )  # fmt: skip
 
 
-def test_a_panel_that_is_opened_is_given_the_newest_message_and_what_follows(
-    server: FoxgloveServer, client: Client
-) -> None:
+def test_opened_panel_receives_the_newest_and_later_messages(server: FoxgloveServer, client: Client) -> None:
     server.show("robot1/detector/found", found(0))
     client.subscribe("/detector/found", 7)
     subscription, stamp, data = client.data.get(timeout=WITHIN)

@@ -148,7 +148,7 @@ def test_the_fields_of_a_declared_state_are_shown_with_their_types() -> None:
     assert CatalogueEntry("x:Mapper", graph_operators.Mapper).to_json()["state"] == []
 
 
-def test_one_operator_is_looked_up_by_name_or_path_with_the_errors_of_the_whole_catalogue() -> None:
+def test_single_operator_is_looked_up_by_name_or_path() -> None:
     assert look_up("CloudBuilder").use == "operators.cloud:CloudBuilder"
     assert look_up("graph_operators:CloudBuilder").operator is graph_operators.CloudBuilder
     with pytest.raises(LookupError, match="no operator 'CloudBilder': did you mean 'CloudBuilder'"):

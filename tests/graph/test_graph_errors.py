@@ -419,9 +419,7 @@ operators:
         ("limit=none", "threads must be a whole number from 1 to 256, not the text 'none'", 7, "graph.yaml:3:10"),
     ],
 )
-def test_fault_of_a_value_that_a_setting_gives_the_graph_is_shown_where_it_was_given(
-    setting: str, message: str, column: int, used: str
-) -> None:
+def test_error_of_a_setting_is_shown_in_the_setting(setting: str, message: str, column: int, used: str) -> None:
     (problem,) = problems(GIVEN, settings=[setting])
 
     assert (problem.file, problem.line, problem.column, problem.message) == ("--set", 1, column, message)
@@ -436,7 +434,7 @@ def test_fault_of_a_text_with_a_setting_in_it_stays_where_the_text_is() -> None:
     assert str(problem).startswith("graph.yaml:4:17: module 'graph_operators' has no operator 'Camra'")
 
 
-def test_fault_of_a_graph_parameter_tells_where_its_value_is_given() -> None:
+def test_graph_parameter_error_points_to_where_its_value_is_given() -> None:
     text = GIVEN.replace("rate: 30", "rate: -3")
     (problem,) = problems(text)
 

@@ -422,7 +422,7 @@ operators:
     assert node.inputs["lens"] == ()
 
 
-def test_network_is_loopback_unless_the_graph_says_more() -> None:
+def test_network_is_loopback_unless_the_graph_configures_more() -> None:
     head = 'graph: g\noperators:\n  camera: {use: "graph_operators:Camera"}\n'
     section = "network: {listen: [tcp/0.0.0.0:7447], connect: tls/base.local:7447, shared_memory: false}\n"
     network = load_text(head + section).network

@@ -12,7 +12,7 @@ GRAPH = load_text(
 )
 
 
-def test_what_an_operator_depends_on_and_what_depends_on_it() -> None:
+def test_upstream_and_downstream_of_an_operator() -> None:
     assert upstream(GRAPH, ["c"]) == {"cam", "a", "b"}
     assert upstream(GRAPH, ["cam"]) == set()
     assert downstream(GRAPH, ["a"]) == {"b", "c", "aside"}
@@ -29,7 +29,7 @@ def test_an_operator_of_a_loop_depends_on_itself() -> None:
     assert downstream(loop, ["tick"]) == {"sum"}
 
 
-def test_makers_are_repeated_up_to_what_is_held_and_never_sources() -> None:
+def test_producers_are_repeated_up_to_held_streams_and_never_sources() -> None:
     assert with_makers((), GRAPH, ["c"]) == {"a", "b", "c"}
     assert with_makers((), GRAPH, ["a"]) == {"a"}
     assert with_makers(GRAPH.nodes["a"].outputs.values(), GRAPH, ["c"]) == {"b", "c"}

@@ -48,7 +48,7 @@ def test_a_module_beside_a_nested_graph_is_found(tmp_path: Path) -> None:
     assert "p/a" in load_graph(graph(tmp_path / "g.yaml", "operators: {p: {use: parts/part.yaml}}")).nodes
 
 
-def test_what_lies_beside_the_graph_replaces_no_installed_module(tmp_path: Path) -> None:
+def test_module_beside_the_graph_shadows_no_installed_one(tmp_path: Path) -> None:
     (tmp_path / "colorsys.py").write_text("raise RuntimeError('hijacked')\n")
     sys.modules.pop("colorsys", None)
     load_graph(graph(tmp_path / "g.yaml", f"operators: {{a: {{use: '{module(tmp_path, 'beside_colorsys')}'}}}}"))
@@ -107,9 +107,7 @@ def test_a_graph_that_does_not_ask_for_its_folder_does_not_keep_it(tmp_path: Pat
     assert load_text("graph: g\noperators: {a: {use: 'needs_no_folder:Here'}}\n").sources_bundle.folder == ""
 
 
-def test_a_folder_that_this_process_was_started_with_is_named_among_those_looked_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_initial_folder_is_listed_among_the_searched_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
 
     search.add_folder(tmp_path)

@@ -67,9 +67,7 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
 
 
 @pytest.mark.parametrize(("slam", "tracker"), [(False, "odometry"), (True, "slam")])
-def test_a_correction_of_the_extrinsics_does_not_reach_the_trackers_which_refuse_another_calibration(
-    slam: bool, tracker: str
-) -> None:
+def test_corrected_extrinsics_do_not_reach_the_trackers(slam: bool, tracker: str) -> None:
     words = ["perception.calibrate=true", f"perception.slam={slam}"]
     graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=words)
 

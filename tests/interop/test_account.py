@@ -85,7 +85,7 @@ def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_pat
         assert streams.account.unread["/imu"].count == 1
 
 
-def test_what_a_type_has_no_place_for_is_named_with_its_number(tmp_path: Path) -> None:
+def test_unmapped_fields_are_named_with_their_count(tmp_path: Path) -> None:
     scan = {"ranges": np.ones(5, np.float32), "angle_increment": 0.1, "angle_max": 0.4, "range_max": 9.0}
     rows = [
         ("/scan", s, ros("sensor_msgs/LaserScan", header=header(s, "laser"), scan_time=0.1 * (i > 2), **scan))
@@ -165,7 +165,7 @@ def test_fields_that_were_read_or_hold_nothing_are_not_named() -> None:
     assert "max_range" not in seen.unread()
 
 
-def test_16_bits_ranges_and_measurements_keep_what_they_hold_there_and_back(tmp_path: Path) -> None:
+def test_16_bit_images_ranges_and_measurements_survive_the_round_trip(tmp_path: Path) -> None:
     warm = (7000 + np.arange(24, dtype=np.uint16)).reshape(4, 6)
     wide = np.array([[500_000.01, 5_000_000.02, 3.0], [500_000.02, 5_000_000.03, 4.0]])
     cells = np.zeros(4, np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
@@ -274,7 +274,7 @@ def test_all_of_a_bag_in_simulated_time_is_on_one_clock(tmp_path: Path) -> None:
     assert min(times) == 900 * SECOND
 
 
-def test_a_depth_topic_that_is_none_is_refused_with_what_it_is(tmp_path: Path) -> None:
+def test_depth_topic_of_another_type_is_refused_with_its_type(tmp_path: Path) -> None:
     bag = write_ros2(tmp_path / "bag", imus(STAMPS))
 
     with closing(open_bag(bag)) as opened, pytest.raises(BagError, match="read as Imu, which cannot be depth"):

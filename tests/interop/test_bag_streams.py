@@ -132,7 +132,7 @@ def test_static_streams_are_one_message_of_all_transforms_and_the_first_calibrat
     assert notes == {"r/tf": "2 messages as one", "r/info": "the first of 3; 1 differ from it"}
 
 
-def test_what_cannot_be_opened_is_refused_with_a_reason(tmp_path: Path) -> None:
+def test_unreadable_bag_is_refused_with_a_reason(tmp_path: Path) -> None:
     def refused(name: str, data: bytes) -> str:
         path = tmp_path / name
         path.write_bytes(data)
@@ -150,7 +150,7 @@ def test_what_cannot_be_opened_is_refused_with_a_reason(tmp_path: Path) -> None:
         open_bag(tmp_path / "none")
 
 
-def test_what_cannot_be_played_is_refused_with_a_reason(tmp_path: Path) -> None:
+def test_unknown_topic_or_type_is_refused_with_a_reason(tmp_path: Path) -> None:
     path = write_ros2(tmp_path / "bag", imus(STAMPS))
 
     for played, told in (

@@ -73,7 +73,7 @@ STATIC = ("camera/image_info", "camera/depth_info", "tf")
 
 
 @pytest.mark.parametrize("kind", sorted(OUTWARD, key=lambda t: t.SCHEMA), ids=lambda t: t.SCHEMA)
-def test_message_goes_to_ros_and_comes_back_through_serialised_bytes(kind: type[Message]) -> None:
+def test_message_survives_the_round_trip_through_ros_bytes(kind: type[Message]) -> None:
     if kind.SCHEMA == "CompressedDepth":
         pytest.skip("its example has a scale of its own; the depth formats are tested apart")
     store = typestore()
@@ -278,7 +278,7 @@ def test_rgbd_folders_are_read_back_with_the_same_pixels_depths_and_poses(tmp_pa
     assert dataset.static_outputs()["depth_info"].fx == 50.0
 
 
-def test_images_and_poses_without_a_depth_image_are_counted_as_7scenes_leaves_them_out(tmp_path: Path) -> None:
+def test_images_and_poses_without_depth_are_counted_as_lost_by_7scenes(tmp_path: Path) -> None:
     made = frames()
     made["camera/depth"] = made["camera/depth"][::3]
 

@@ -79,7 +79,7 @@ def test_they_go_along_into_every_mcap(tmp_path: Path, to: str, make: str) -> No
             assert reader.message_count == 3
 
 
-def test_from_a_recording_to_ros_and_back_they_are_what_they_were(tmp_path: Path) -> None:
+def test_attachments_and_metadata_survive_the_round_trip_through_ros(tmp_path: Path) -> None:
     path = ours(tmp_path / "a.mcap")
     converted(path, tmp_path / "bag", "ros2")
     converted(tmp_path / "bag", tmp_path / "back.mcap", "mcap")
@@ -99,7 +99,7 @@ def test_names_that_a_recording_gives_a_meaning_to_get_the_files_in_front(tmp_pa
         assert "machine" not in recording.metadata
 
 
-def test_of_the_files_of_a_split_bag_they_are_taken_once_and_those_that_differ_both(tmp_path: Path) -> None:
+def test_equal_attachments_of_a_split_bag_are_taken_once_and_different_ones_kept(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     foreign(folder / "bag_0.mcap", "/said", CALIBRATION, robot="r1", rosbag2="first")
     foreign(folder / "bag_1.mcap", "/said", CALIBRATION, ("calibration.yaml", "text/yaml", 9, 9, b""), robot="r2")
@@ -112,7 +112,7 @@ def test_of_the_files_of_a_split_bag_they_are_taken_once_and_those_that_differ_b
 
 
 @pytest.mark.parametrize("to", ["csv", "rrd"])
-def test_formats_without_a_place_for_them_say_what_they_leave_out(tmp_path: Path, to: str) -> None:
+def test_formats_without_attachments_report_those_left_out(tmp_path: Path, to: str) -> None:
     path = ours(tmp_path / "a.mcap")
 
     shown = converted(path, tmp_path / ("out" if to == "csv" else "out.rrd"), to)

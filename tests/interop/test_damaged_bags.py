@@ -273,7 +273,7 @@ def test_a_download_whose_second_half_is_zeros_is_read_and_fails_the_command(tmp
         (b"<!DOCTYPE html><html><body>404", "page of the web"),
     ],
 )
-def test_what_is_found_in_place_of_a_bag_is_named(tmp_path: Path, content: bytes, told: str) -> None:
+def test_file_that_is_no_bag_is_refused_with_what_it_holds(tmp_path: Path, content: bytes, told: str) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
 
     with pytest.raises(BagError, match=told):

@@ -56,7 +56,7 @@ def arm(frames: int = 6) -> dict[str, list[Message]]:
     return {"camera/image": images, "arm/joints": joints, "cmd/twist": commands, "said": [Text(stamp=START, text="go")]}
 
 
-def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: Path) -> None:
+def test_lerobot_frame_holds_an_image_with_the_newest_other_messages(tmp_path: Path) -> None:
     streams_of = arm()
 
     path = of_robot(tmp_path / "a.mcap", streams_of)
@@ -78,7 +78,7 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
 
 
-def test_what_no_frame_of_a_lerobot_dataset_takes_is_counted_as_lost_and_not_as_written(tmp_path: Path) -> None:
+def test_messages_in_no_lerobot_frame_are_counted_as_lost(tmp_path: Path) -> None:
     streams_of = arm()
     for k in (4, 5):  # a pause of an hour in front of them
         moved = streams_of["camera/image"][k]
@@ -153,7 +153,7 @@ def test_a_lerobot_dataset_of_format_3_locates_its_episodes(tmp_path: Path) -> N
     ]
 
 
-def test_a_stream_whose_messages_change_in_size_is_named_with_what_leaves_it_out(tmp_path: Path) -> None:
+def test_stream_of_varying_size_is_named_with_the_option_to_omit_it(tmp_path: Path) -> None:
     streams = arm()
     longer = JointState(stamp=START + 11 * SECOND // 10, names=("a", "b", "c"), positions=np.zeros(3))
     late = Image(stamp=START + 12 * SECOND // 10, frame="c", data=np.zeros((12, 16, 3), np.uint8))

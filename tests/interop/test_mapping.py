@@ -15,7 +15,7 @@ IMAGE, DEPTH = wanted("camera/image", "Image"), wanted("camera/depth", "DepthIma
 LEFT, RIGHT = wanted("camera/left", "Image"), wanted("camera/right", "Image")
 
 
-def test_types_alone_settle_what_leaves_no_choice() -> None:
+def test_unambiguous_types_settle_the_mapping() -> None:
     topics = [AvailableTopic("/rgb", ("Image",), 5), AvailableTopic("/d", ("CompressedDepth", "DepthImage"), 5)]
 
     found = propose([IMAGE, DEPTH], topics, {})
@@ -55,7 +55,7 @@ def test_given_topics_are_taken_and_not_proposed_again() -> None:
     assert {m.wanted.name: m.topic for m in found.matches} == {"camera/left": "/b", "camera/right": "/a"}
 
 
-def test_what_nothing_needs_is_only_filled_where_it_is_given() -> None:
+def test_optional_stream_is_mapped_only_if_given() -> None:
     spare = wanted("camera/ground_truth", "Pose", needed=False)
     topics = [AvailableTopic("/pose", ("Pose",), 5)]
 

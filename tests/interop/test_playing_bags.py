@@ -143,7 +143,7 @@ def _rows_of(bag: Path) -> list[Any]:
         return [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
 
 
-def test_all_of_the_recording_of_a_replay_is_on_the_clock_of_what_was_played(graph: Path, tmp_path: Path) -> None:
+def test_recording_of_a_replay_uses_the_clock_of_the_bag(graph: Path, tmp_path: Path) -> None:
     rows = []
     for i in range(20):
         simulated, wall = (900 + i) * SECOND, (1_700_000_000 + i) * SECOND

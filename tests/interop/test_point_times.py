@@ -128,7 +128,7 @@ def png(dtype: str) -> Any:
         ("rgb8; png compressed bgr8", CompressedImage),
     ],
 )
-def test_the_format_says_whether_16_bits_are_grey_or_depth(format_: str, kind: type[Any]) -> None:
+def test_format_decides_whether_16_bits_are_grey_or_depth(format_: str, kind: type[Any]) -> None:
     assert type(compressed(format_, png("u2"), "camera", STAMP)) is kind
 
 

@@ -85,9 +85,7 @@ def test_messages_missing_from_the_database_are_reported(opened: Opened, tmp_pat
 
 
 @pytest.mark.parametrize("read_only", [False, True])
-def test_what_a_killed_recorder_left_in_the_write_ahead_log_is_read(
-    opened: Opened, tmp_path: Path, read_only: bool
-) -> None:
+def test_write_ahead_log_of_a_killed_recorder_is_read(opened: Opened, tmp_path: Path, read_only: bool) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     database = sqlite3.connect(folder / "bag.db3")
     database.execute("pragma journal_mode=wal")
@@ -226,7 +224,7 @@ def test_a_missing_numbered_file_is_noted(opened: Opened, tmp_path: Path) -> Non
     assert bag.notes == ("the files are numbered, and 2 is not there",)
 
 
-def test_what_a_killed_recorder_had_half_written_is_taken_back(opened: Opened, tmp_path: Path) -> None:
+def test_unfinished_transaction_of_a_killed_recorder_is_rolled_back(opened: Opened, tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     before = (folder / "bag.db3").read_bytes()
     database = sqlite3.connect(folder / "bag.db3", isolation_level=None)

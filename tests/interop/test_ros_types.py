@@ -38,7 +38,7 @@ def test_every_mapped_type_is_a_type_of_ros() -> None:
     assert set(CONVERSIONS) - known == {"tf/msg/tfMessage"}  # of ROS before Groovy
 
 
-def test_image_and_depth_are_told_apart_by_encoding() -> None:
+def test_encoding_distinguishes_image_from_depth() -> None:
     bgr = {"encoding": "bgr8", "step": 3, "data": flat(np.uint8([1, 2, 3]))}
     deep = {"encoding": "16UC1", "step": 2, "data": flat(np.uint16([1500]))}
     colour, depth = (
@@ -299,7 +299,7 @@ def test_small_types(message: Any, field: str, value: Any) -> None:
     assert (found.stamp, getattr(found, field)) == (STAMP, value)
 
 
-def test_every_mapped_type_converts_when_all_its_fields_are_empty_or_says_why() -> None:
+def test_mapped_types_with_empty_fields_convert_or_raise() -> None:
     refused = {"Image", "CompressedImage", "CameraInfo", "PointCloud2", "OccupancyGrid", "Marker", "LaserScan"}
     refused |= {"CompressedVideo", "FFMPEGPacket"}
     for name in CONVERSIONS:

@@ -33,6 +33,6 @@ def test_images_come_back_bit_for_bit(name: str) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff" * 64, bytes(8), np.array([0x12345678], "<u4").tobytes()])
-def test_what_is_no_image_is_refused(data: bytes) -> None:
+def test_malformed_rvl_data_is_refused(data: bytes) -> None:
     with pytest.raises(RecordingError, match="RVL"):
         unpacked_rvl(np.frombuffer(data, np.uint8), 768)

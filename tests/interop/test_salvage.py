@@ -43,7 +43,7 @@ def test_a_database_is_salvaged_whole_where_nothing_is_missing(tmp_path: Path) -
     assert saved(folder / "bag.db3") == expected
 
 
-def test_a_database_that_was_cut_off_gives_what_is_before_the_cut(tmp_path: Path) -> None:
+def test_truncated_database_yields_messages_before_the_cut(tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "bag", imus(STAMPS), "sqlite3")
     data = (folder / "bag.db3").read_bytes()
     (tmp_path / "cut.db3").write_bytes(data[: len(data) * 2 // 3])

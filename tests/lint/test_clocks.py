@@ -58,7 +58,7 @@ def test_a_few_seconds_tell_nothing_however_alike_they_are() -> None:
     assert clock_difference(turning(np.arange(1.0, 12.0, 0.03), swaying), reference) is not None
 
 
-def test_what_would_be_no_clock_is_not_taken_for_a_drift() -> None:
+def test_implausible_clock_drift_is_rejected() -> None:
     reference = turning(np.arange(0.0, 40.0, 0.01), swaying)
     assert clock_difference(turning(np.arange(5.0, 35.0, 0.03), swaying, drift=0.05), reference) is None
 

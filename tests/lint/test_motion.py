@@ -94,7 +94,7 @@ def test_a_motion_that_agrees_stands_still_or_is_not_stated_is_sound() -> None:
     assert found(imu=[m.replace(orientation=None) for m in imu()]) == []
 
 
-def test_what_no_single_mistake_explains_is_not_judged() -> None:
+def test_errors_without_a_single_explanation_are_not_reported() -> None:
     random = np.random.default_rng(1)
 
     assert found(imu=[m.replace(angular_velocity=random.normal(size=3)) for m in imu()]) == []

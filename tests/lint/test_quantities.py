@@ -60,14 +60,14 @@ STAMPS = every(0.1)
         ([depth(s, 1.0).replace(data=sloping(s, ">").data / np.float32(1000)) for s in STAMPS], "two bytes swapped"),
     ],
 )
-def test_what_cannot_be_is_named_with_the_unit_that_makes_sense(messages: list[Message], told: str) -> None:
+def test_implausible_quantity_is_reported_with_the_likely_unit(messages: list[Message], told: str) -> None:
     found = [f.text for f in lint(MadeInput({"a": messages})).findings if f.check == "quantity"]
 
     assert len(found) == 1
     assert told in found[0]
 
 
-def test_what_can_be_is_not_named() -> None:
+def test_plausible_quantities_are_not_reported() -> None:
     sound = {
         "imu": [imu(s) for s in STAMPS],
         "depth": [depth(s, 2.0) for s in STAMPS],

@@ -23,7 +23,7 @@ def test_a_sound_recording_has_no_findings() -> None:
     assert findings({"a": every(0.1), "b": every(0.01)}) == []
 
 
-def test_a_gap_is_named_with_its_length_place_and_what_is_missing() -> None:
+def test_gap_is_reported_with_length_place_and_missing_messages() -> None:
     stamps = [s for s in every(0.1) if not 3.05 <= (s - BEGIN) / SECOND < 5.05]
     (found,) = lint(MadeInput({}, {"a": stamps, "b": every(0.1)})).findings
     assert (found.check, found.stream, found.at) == ("gap", "a", BEGIN + 3 * SECOND)
@@ -67,7 +67,7 @@ def test_a_contract_bounds_rates_and_gaps_and_names_streams() -> None:
     ]
 
 
-def test_what_a_contract_accepts_is_no_finding() -> None:
+def test_gap_allowed_by_the_contract_is_no_finding() -> None:
     stamps = {"robot1/a": [s for s in every(0.1) if not 3.0 < (s - BEGIN) / SECOND < 5.0]}
     assert findings(stamps) == [("gap", "robot1/a")]
     assert findings(stamps, Contract.model_validate({"streams": {"a": {"allow": ["gap"]}}})) == []

@@ -116,7 +116,7 @@ def test_a_tool_follows_and_asks_and_no_more(buses: dict[str, Bus]) -> None:
     assert is_answered(here, here, RELOAD)
 
 
-def test_a_machine_speaks_as_itself_and_answers_for_its_operators(buses: dict[str, Bus]) -> None:
+def test_machine_publishes_under_its_name_and_serves_its_operators(buses: dict[str, Bus]) -> None:
     here, robot = buses["here"], buses["robot"]
 
     assert puts_reach(robot, here, machine_key("robot", "run", "up"))

@@ -21,7 +21,7 @@ def sent(folder: Path, content: bytes) -> str:
     return digest
 
 
-def test_the_copy_of_an_earlier_run_does_not_stand_in_for_a_file_that_is_gone(tmp_path: Path) -> None:
+def test_copy_of_an_earlier_run_does_not_replace_a_missing_file(tmp_path: Path) -> None:
     digest = sent(tmp_path, b"old")
     parameters = [{"layers": [{"weights": WEIGHTS}], "rate": 30}]
 
@@ -50,9 +50,7 @@ def test_a_torn_list_of_copies_is_none(tmp_path: Path) -> None:
     assert not files.left_over([{"weights": WEIGHTS}], {}, tmp_path)
 
 
-def test_programs_for_two_processors_are_not_the_same_file_and_those_for_one_are_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_programs_are_compared_only_for_the_same_processor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     X86, ARM = b"\x3e\x00", b"\xb7\x00"
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "rig_of_programs.py").write_text('command = ("./edges",)\n')
@@ -71,7 +69,7 @@ def test_programs_for_two_processors_are_not_the_same_file_and_those_for_one_are
     assert files.differences(here, files.code_of(["rig_of_programs:Edges"])) == ["edges differs"]
 
 
-def test_code_is_compared_without_importing_it_so_a_module_that_is_missing_is_named(
+def test_code_is_compared_without_import_and_missing_modules_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
@@ -89,7 +87,7 @@ def test_code_is_compared_without_importing_it_so_a_module_that_is_missing_is_na
 
 
 @pytest.mark.parametrize("named", ["w/net.txt", "./w/net.txt"])
-def test_a_file_that_a_parameter_names_is_sent_also_where_the_text_of_a_module_names_it(
+def test_file_named_by_a_parameter_is_sent_though_a_module_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)

@@ -15,7 +15,7 @@ from dataflow.process.streams.inbox import Inbox
 LONG = AWAY_AFTER + 1
 
 
-def test_an_agent_without_a_run_is_offered_one_and_another_of_its_name_gets_nothing() -> None:
+def test_idle_agent_is_offered_the_run_and_its_namesake_is_not() -> None:
     claims = Claims("run")
     assert claims.answer("robot", b"1", "", None, 0.0) == "offer"
     assert claims.answer("robot", b"2", "", None, 0.1) == "another"
@@ -24,7 +24,7 @@ def test_an_agent_without_a_run_is_offered_one_and_another_of_its_name_gets_noth
     assert claims.answer("arm", b"3", "former", None, 0.0) == "busy"
 
 
-def test_an_agent_that_left_the_run_or_was_started_anew_is_noticed() -> None:
+def test_agent_that_left_the_run_or_restarted_is_detected() -> None:
     claims = Claims("run")
     claims.answer("robot", b"1", "", None, 0.0)
     assert claims.answer("robot", b"1", "run", LONG, 40.0) == ""  # a long stall: it goes on
@@ -34,7 +34,7 @@ def test_an_agent_that_left_the_run_or_was_started_anew_is_noticed() -> None:
     assert claims.answer("robot", b"2", "", LONG, 44.0) == "anew"
 
 
-def test_the_claim_of_an_agent_that_is_gone_before_it_joined_lapses() -> None:
+def test_claim_of_an_agent_that_never_joined_expires() -> None:
     claims = Claims("run")
     claims.answer("robot", b"1", "", None, 0.0)
     assert claims.answer("robot", b"2", "", None, LONG) == "offer"

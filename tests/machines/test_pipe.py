@@ -95,7 +95,7 @@ def test_loss_of_last_frame_is_detected_by_the_mark(link: Link, ends: Ends) -> N
     assert lost
 
 
-def test_what_waits_for_a_dead_link_is_bounded_and_what_must_not_be_missed_is_kept(
+def test_queue_of_a_dead_link_is_bounded_and_keeps_lossless_messages(
     link: Link, ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipes, "MOST_WAITING", 1000)
@@ -166,9 +166,7 @@ class SlowLink:
 
 @pytest.mark.parametrize("delay", [0.002, 0.3])
 @pytest.mark.parametrize("rate", [125e3, 1e6, 20e6])
-def test_a_slow_link_is_used_up_and_what_is_on_it_delays_a_beat_by_less_than_a_silence(
-    rate: float, delay: float
-) -> None:
+def test_saturated_slow_link_delays_heartbeats_below_the_timeout(rate: float, delay: float) -> None:
     link = SlowLink(rate, delay)
 
     assert link.go(20) < pipes.AWAY_AFTER
@@ -205,7 +203,7 @@ def test_exchanges_from_before_a_clock_was_set_are_forgotten() -> None:
     assert clocks.best == (40, 50_000)
 
 
-def test_what_waits_is_looked_at_seldom_however_much_of_it_may_not_be_dropped(
+def test_queue_is_seldom_scanned_for_droppable_messages(
     link: Link, ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipes, "MOST_WAITING", 10_000)

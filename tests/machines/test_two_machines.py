@@ -169,9 +169,7 @@ def test_a_machine_that_lacks_a_module_is_named_let_go_and_takes_the_next_run(
 
 
 @pytest.mark.long
-def test_a_process_of_another_machine_that_dies_is_started_again_there_or_ends_the_run(
-    robot: Robot, tmp_path: Path
-) -> None:
+def test_dead_remote_process_is_restarted_there_or_ends_the_run(robot: Robot, tmp_path: Path) -> None:
     dying = GRAPH.replace("size: SIZE}", f"dies: '{tmp_path / 'died'}'}}")
 
     with pytest.raises(RunFailed, match=r"process 'sensor' was killed by SIGKILL"):
@@ -205,7 +203,7 @@ def test_a_graph_that_names_machines_does_not_silently_run_on_one() -> None:
 
 
 @pytest.mark.long
-def test_a_supervisor_that_is_killed_leaves_no_operators_and_the_machine_takes_the_next_run(tmp_path: Path) -> None:
+def test_killed_supervisor_leaves_no_operators_and_the_machine_accepts_a_run(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path / 'meet'}"
     agent = join("robot", endpoint, tmp_path / "files", "--timeout", "2")
     graph = tmp_path / "two.yaml"

@@ -138,7 +138,7 @@ def test_a_message_cannot_be_changed() -> None:
         message.points[0, 0] = 1
 
 
-def test_replace_changes_only_what_it_names() -> None:
+def test_replace_changes_only_the_named_fields() -> None:
     message = Probe(stamp=0, text="a", points=POINTS)
     changed = message.replace(text="b")
     assert (changed.text, changed.stamp, message.text) == ("b", 0, "a")
@@ -192,12 +192,12 @@ def test_compute_digest_notices_a_change_of_frozen_memory() -> None:
         ({"stamp": 2**63 - 1}, r"Probe\.stamp 9223372036854775807 is outside"),
     ],
 )
-def test_an_error_names_the_field_and_what_is_right(values: dict[str, object], error: str) -> None:
+def test_error_names_the_field_and_the_expected_value(values: dict[str, object], error: str) -> None:
     with pytest.raises(MessageError, match=error):
         Probe(**({"stamp": 0, "points": POINTS} | values))
 
 
-def test_a_field_cannot_hide_what_every_message_has() -> None:
+def test_field_cannot_shadow_a_message_attribute() -> None:
     with pytest.raises(MessageError, match=r"Hiding\.digest: every message has 'digest' already"):
         type("Hiding", (Message,), {"digest": scalar("str", "x")})
 
@@ -223,7 +223,7 @@ def test_from_parts_keeps_the_arrays_without_a_copy() -> None:
     assert again.points is message.points
 
 
-def test_from_parts_refuses_what_is_not_frozen_or_of_another_form() -> None:
+def test_from_parts_refuses_unfrozen_arrays_and_other_forms() -> None:
     message = Probe(stamp=5, points=POINTS)
     header, arrays = message.header(), message.arrays()
     with pytest.raises(MessageError, match="takes 7 header fields and 4 arrays, got 6 and 4"):
@@ -240,7 +240,7 @@ def test_from_parts_refuses_what_is_not_frozen_or_of_another_form() -> None:
         Probe.from_parts(5, (*header[:3], None, *header[4:]), arrays)
 
 
-def test_repr_is_short_and_says_shapes() -> None:
+def test_repr_is_short_and_gives_shapes() -> None:
     text = repr(Probe(stamp=5, points=np.zeros((1000, 3), np.float32)))
     assert text.startswith("Probe(stamp=5, flag=False")
     assert "points=float32[1000, 3]" in text
@@ -257,5 +257,5 @@ def test_two_messages_are_equal_exactly_when_their_bits_are(a: float, b: float, 
 
 @given(st.lists(st.text(), max_size=4), st.lists(st.text(), max_size=4))
 @settings(max_examples=100, deadline=None)
-def test_lists_of_strings_are_told_apart(a: list[str], b: list[str]) -> None:
+def test_different_lists_of_strings_are_unequal(a: list[str], b: list[str]) -> None:
     assert (Probe(stamp=0, words=a, points=[]) == Probe(stamp=0, words=b, points=[])) == (a == b)

@@ -7,7 +7,7 @@ from pathlib import Path
 from messages_page import families, markdown
 
 
-def test_the_page_is_what_the_declarations_say(repository: Path) -> None:
+def test_messages_page_matches_the_declarations(repository: Path) -> None:
     page = (repository / "docs" / "messages.md").read_text(encoding="utf-8")
     assert page == markdown(), "run: python tools/messages_page.py > docs/messages.md"
 

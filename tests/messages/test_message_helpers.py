@@ -45,7 +45,7 @@ def test_image_dimensions() -> None:
     assert not image.replace(data=np.zeros((4, 6), np.uint8)).is_color
 
 
-def test_laser_points_leave_out_what_is_no_return() -> None:
+def test_laser_points_omit_missing_returns() -> None:
     ranges = [2.0, np.inf, np.nan, 0.0, 0.05, 50.0, 3.0]
     scan = m.LaserScan(
         stamp=0, frame="l", angle_min=-np.pi / 2, angle_max=np.pi / 2, range_min=0.1, range_max=30.0, ranges=ranges
@@ -71,7 +71,7 @@ def test_labels_name_classes() -> None:
     assert found.replace(class_names=()).labels() == ("1", "0")
 
 
-def test_detections_without_masks_keep_the_digest_that_they_had_before_there_were_any() -> None:
+def test_detections_without_masks_keep_their_earlier_digest() -> None:
     found = m.Detections2D(
         stamp=1, frame="camera", width=12, height=4, class_names=("cup",), boxes=[[1, 1, 5, 3]], scores=[0.5],
         class_ids=[0],

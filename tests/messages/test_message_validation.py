@@ -239,7 +239,7 @@ def _as_decoded(field: ArrayField, data: Any) -> NDArray[Any] | None:
     return data
 
 
-def test_what_means_nothing_was_measured_is_kept() -> None:
+def test_values_for_missing_measurements_are_kept() -> None:
     odd = np.array([[0.0, -0.0, NAN, np.inf, -1.0]], np.float32)
     assert m.DepthImage(stamp=0, frame="c", data=odd).data.tobytes() == odd.tobytes()
     assert m.PointCloud(stamp=0, frame="l", points=odd[:, :3]).points.tobytes() == odd[:, :3].tobytes()

@@ -45,7 +45,7 @@ def test_a_thing_is_carried_by_the_likeliest_alone() -> None:
     assert told.carried(2) == (0,)
 
 
-def test_a_thing_is_told_in_place_of_its_top() -> None:
+def test_carrier_is_the_object_in_place_of_its_top() -> None:
     made = graph("mug table tabletop", (0, "on", 1, 0.7), (0, "on", 2, 0.9), (2, "part_of", 1, 0.9), places={2: -11})
     told = summarize(made)
     assert {child: r.object for child, r in told.carriers.items()} == {0: 1, 2: 1}
@@ -71,7 +71,7 @@ def test_nothing_carries_itself_by_whatever_way(relations: list[Relation]) -> No
         assert (child, relation.predicate, relation.object) in {(s, p, o) for s, p, o, _ in relations}
 
 
-def test_what_holds_between_almost_all_is_not_told() -> None:
+def test_relations_between_almost_all_objects_are_omitted() -> None:
     near = [(a, "near", b, 1.0) for a in range(4) for b in range(a)]
     told = summarize(graph("mug mug mug person", *near, (3, "holding", 1, 0.8), (0, "under", 2, 0.4)))
     assert [(r.subject, r.predicate, r.object) for r in told.telling] == [(3, "holding", 1)]
@@ -90,13 +90,13 @@ def test_an_agent_faces_one_thing() -> None:
     assert [(r.subject, r.predicate, r.object) for r in told.telling] == [(0, "facing", 2), (1, "above", 2)]
 
 
-def test_intentions_are_told_however_unlikely_and_the_likeliest_first() -> None:
+def test_intentions_of_any_likelihood_are_listed_likeliest_first() -> None:
     told = summarize(graph("person chair door", (0, "heads_for", 1, 0.2), (0, "heads_for", 2, 0.7)))
     assert [(r.object, round(r.score, 1)) for r in told.intentions] == [(2, 0.7), (1, 0.2)]
     assert not told.telling
 
 
-def test_people_come_with_what_they_do_and_a_ball_beside_them_is_what_moves() -> None:
+def test_people_are_summarized_with_activities_and_the_ball_as_a_mover() -> None:
     scene = graph("ball person chair", (1, "heads_for", 2, 0.76), (0, "on", 2, 0.9))
     acts = Activity(
         stamp=0, class_names=("walking", "resting"), subjects=np.array([2, 1]),
@@ -107,7 +107,7 @@ def test_people_come_with_what_they_do_and_a_ball_beside_them_is_what_moves() ->
     assert movers_in_words(scene, told, acts) == [Row("ball 1", "resting 50 %, on chair 3")]
 
 
-def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone() -> None:
+def test_carried_objects_are_grouped_by_class_and_single_ones_listed_on_the_floor() -> None:
     scene = graph(
         "floor table book book mug lamp",
         (1, "on", 0, 0.9), (2, "on", 1, 0.9), (3, "on", 1, 0.9), (4, "in", 1, 0.9), (5, "on", 0, 0.9),
@@ -117,7 +117,7 @@ def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone
     assert [(row.name, row.text) for row in rows] == [("table 2", "on it 2 books; in it mug 5"), ("floor 0", "lamp 6")]
 
 
-def test_agents_are_what_acts_whatever_its_class() -> None:
+def test_agents_are_determined_by_acting_not_by_class() -> None:
     scene = graph("zorb mug table", (0, "holding", 1, 0.9), (1, "on", 2, 0.9))
     assert summarize(scene).agents == {0}
     acts = Activity(
@@ -134,7 +134,7 @@ def test_groups_are_in_english() -> None:
     assert grouped(["mug 1", "box 2", "box 3"], ["mug", "box", "box"]) == "2 boxes, mug 1"
 
 
-def test_a_graph_without_names_and_scores_is_told_too() -> None:
+def test_graph_without_names_and_scores_is_summarized() -> None:
     scene = SceneGraph(
         stamp=0, frame="", predicates=("on",), ids=np.array([7, 8]), class_ids=np.array([0, 3], np.int32),
         positions=np.zeros((2, 3)), sizes=np.ones((2, 3)), subjects=np.array([0], np.int32),

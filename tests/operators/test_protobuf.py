@@ -20,7 +20,7 @@ def test_fields_are_written_as_protobuf_writes_them() -> None:
         assert number_field(1, seconds) == Timestamp(seconds=seconds).SerializeToString()
 
 
-def test_what_is_read_is_all_that_was_written() -> None:
+def test_fields_read_are_those_written() -> None:
     written = Struct()
     for k in range(5):
         written.fields[f"key {k}"].number_value = k / 3  # 8 bytes of fixed size
@@ -43,6 +43,6 @@ def test_what_is_read_is_all_that_was_written() -> None:
         (b"\x0b", "byte 0 begins no field .*: its kind is 3"),  # a group, which protobuf no longer writes
     ],
 )
-def test_what_is_no_message_is_told(message: bytes, told: str) -> None:
+def test_malformed_message_is_refused(message: bytes, told: str) -> None:
     with pytest.raises(ValueError, match=told):
         list(fields(message))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # imported before the first of these tests runs (tests/confte
     torch = pytest.importorskip("torch")
 
 
-def test_where_the_memory_of_the_gpu_does_not_suffice_the_cpu_does_the_work_and_it_is_counted(
+def test_gpu_out_of_memory_falls_back_to_the_cpu_and_is_counted(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     run = Runner(torch.nn.Linear(2, 1), torch.device("cpu"), half=False)

@@ -115,7 +115,9 @@ def _records(recording: Recording) -> Iterator[Any]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("asked", [3.0, 12.0, 21.7, 29.5])
-def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, tmp_path: Path, asked: float) -> None:
+def test_kept_flight_recording_verifies_from_its_beginning(
+    recorded: Path, graph: Graph, tmp_path: Path, asked: float
+) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[asked])
     facts = sink.close("complete")
 
@@ -134,7 +136,7 @@ def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, 
     assert not (tmp_path / ".ring").exists()
 
 
-def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+def test_kept_flight_recording_replays_from_its_states(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     sink, _ = flown(recorded, graph, tmp_path, asks=[20.0])
     path = Path(sink.close("complete")["kept"][0]["path"])
 
@@ -292,7 +294,7 @@ def test_a_field_or_any_of_its_elements_meets_a_condition(trigger: Trigger, valu
     assert len(list(Triggers([trigger]).message("s", message))) == expected
 
 
-def test_a_graph_says_what_its_flight_recorder_keeps(tmp_path: Path) -> None:
+def test_flight_recorder_settings_are_read_from_the_graph(tmp_path: Path) -> None:
     sys.path.append(str(RUNTIME))
     text = GRAPH.replace(
         "record: {keep: 4s, after: 2s, snapshots: 1s}",

@@ -42,7 +42,7 @@ def wired() -> Iterator[Wired]:
     made.close()
 
 
-def test_what_rings_bring_and_threads_put_comes_in_order(wired: Wired) -> None:
+def test_inbox_orders_ring_messages_and_thread_puts(wired: Wired) -> None:
     wired.inbox.put(("control", "go", {}))
     wired.send(b"1")
     wired.send(b"2", channel=1)
@@ -81,7 +81,7 @@ def test_waiting_writer_is_woken_when_a_full_ring_has_room(wired: Wired) -> None
     assert wired.producer.flush()
 
 
-def test_what_has_arrived_is_counted(wired: Wired) -> None:
+def test_received_messages_are_counted(wired: Wired) -> None:
     wired.send(b"four")
     wired.send(b"two")
     assert wired.inbox.empty() is False

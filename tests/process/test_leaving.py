@@ -31,7 +31,7 @@ class Stuck:
         self.gate.wait()
 
 
-def test_the_parts_are_closed_in_turn_and_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_parts_are_closed_in_order_without_output(capsys: pytest.CaptureFixture[str]) -> None:
     closed: list[str] = []
 
     leave_network("head", Part(closed, "taps").close, Part(closed, "bus").close)

@@ -79,7 +79,7 @@ class OneProcess:
         self.process.progress._channel = SimpleNamespace(send=answer)
 
 
-def test_what_is_done_is_reported_when_there_is_nothing_more_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_reported_before_waiting_for_input(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not when the process has waited for more: the sources may be waiting for this report."""
     monkeypatch.setattr(operator_process, "IDLE_WAIT", 60.0)
     one = OneProcess()
@@ -94,7 +94,7 @@ def test_what_is_done_is_reported_when_there_is_nothing_more_to_do(monkeypatch: 
     assert one.channel.of("progress")[-1]["counts"]["last"][0] == 3
 
 
-def test_what_is_decided_does_not_wait_for_all_that_has_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decided_firing_does_not_wait_for_the_whole_inbox(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(operator_process, "TAKE_WITHIN", 0.0)
     one = OneProcess()
     one.arrives(*range(1000, 1100))

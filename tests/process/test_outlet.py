@@ -103,7 +103,7 @@ def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
     assert linked.outlet.counters()["unsent"] > 0
 
 
-def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: Linked) -> None:
+def test_last_drop_of_an_ended_incarnation_is_counted_as_missed(linked: Linked) -> None:
     linked.outlet.release()
     linked.outlet.message(FAST, entry(FAST, 10, 0))
     linked.outlet.message(FAST, entry(FAST, 20, 1))

@@ -316,7 +316,7 @@ def test_the_oldest_parts_are_deleted_and_the_rest_verifies(recorded: Path, grap
     assert sum(v.firings for v in report.operators) > 20
 
 
-def test_a_full_disk_is_outlived_and_what_is_lost_is_counted(
+def test_recording_survives_a_full_disk_and_counts_the_loss(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def at(seconds: float) -> None:
@@ -360,7 +360,7 @@ def test_no_message_is_in_a_part_behind_a_full_disk_whose_record_is_lost(
         assert stored == {name: info.count for name, info in was.streams.items()}
 
 
-def test_what_a_part_holds_is_counted_once_however_often_it_refuses(
+def test_messages_of_a_part_are_counted_once_despite_refused_writes(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk
 ) -> None:
     """As records of one operator after the other that are to stand in front of it."""
@@ -384,7 +384,7 @@ def test_what_a_part_holds_is_counted_once_however_often_it_refuses(
         assert {n: stored[n] + lost.get(n, 0) for n in stored} == {n: was.streams[n].count for n in stored}
 
 
-def test_a_part_of_which_only_the_end_finds_no_room_is_said_at_once_and_at_the_end(
+def test_part_whose_end_finds_the_disk_full_is_reported_at_once_and_at_the_end(
     recorded: Path, graph: Graph, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """All messages are there, and the next part goes on; but the file does not say that there is one."""
@@ -459,7 +459,7 @@ def test_a_disk_that_stays_full_leaves_a_readable_recording(
         assert part.streams["test/left/fast"].count == 40
 
 
-def test_a_full_disk_ends_what_is_to_end(recorded: Path, graph: Graph, tmp_path: Path, disk: Disk) -> None:
+def test_full_disk_ends_the_run_if_so_configured(recorded: Path, graph: Graph, tmp_path: Path, disk: Disk) -> None:
     def at(seconds: float) -> None:
         disk.full = seconds >= 3
 

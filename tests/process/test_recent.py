@@ -30,7 +30,7 @@ def test_the_last_firings_are_answered_without_drops_and_details() -> None:
     assert not any(record.drops or record.detail for record in found)
 
 
-def test_what_is_no_firing_or_has_failed_is_left_out() -> None:
+def test_recent_firings_omit_failures_and_other_records() -> None:
     found = kept(call(0, kind="setup"), call(1), call(2, kind="snapshot"), call(3), call(4, outcome="error"), call(5))
 
     assert [record.index for record in found] == [1, 3, 5]
@@ -40,7 +40,7 @@ def test_firings_of_long_ago_are_left_out() -> None:
     assert [r.index for r in kept(call(0, ago=OVER + 1), call(1, ago=OVER - 1), call(2))] == [1, 2]
 
 
-def test_each_answer_begins_behind_the_cursor_and_counts_what_is_no_longer_kept() -> None:
+def test_answer_begins_after_the_cursor_and_counts_discarded_records() -> None:
     recent, cursor, told, missed = RecentFirings(), {}, list[int](), list[int]()
     for first, end in ((0, 3), (3, 3), (3, 40), (40, KEPT + 60)):
         for k in range(first, end):

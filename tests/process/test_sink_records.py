@@ -101,7 +101,7 @@ def test_records_that_come_again_after_the_last_ones_are_taken() -> None:
     assert recorder.process.inlet.malformed == 0
 
 
-def test_a_recorder_that_has_ended_waits_for_the_end_of_what_begins_anew() -> None:
+def test_ended_recorder_waits_for_the_end_of_restarted_operators() -> None:
     recorder = Recorder()
 
     def ends(incarnation: int) -> list[dict[str, Any]]:
@@ -118,7 +118,7 @@ def test_a_recorder_that_has_ended_waits_for_the_end_of_what_begins_anew() -> No
     assert [report["expected"] for report in ends(1)] == [0, 1]
 
 
-def test_an_end_that_was_still_on_its_way_from_the_process_before_is_not_that_of_the_successor() -> None:
+def test_delayed_end_of_a_predecessor_is_not_that_of_the_successor() -> None:
     """The recorder was slow: what the killed process had said, up to its end, comes after the word of its successor."""
     recorder = Recorder()
     recorder.process._open.add(STREAM)
@@ -148,7 +148,7 @@ def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys:
     assert capsys.readouterr().err.count(KEY) == 2
 
 
-def test_a_recorder_that_is_asked_for_its_state_says_first_that_it_has_ended() -> None:
+def test_polled_recorder_sends_ended_before_its_state() -> None:
     """A supervisor that heard of the state alone would take the run for stuck: all are idle, and one has not ended."""
     recorder = Recorder()
     for operator in ("camera", "last"):
@@ -162,7 +162,7 @@ def test_a_recorder_that_is_asked_for_its_state_says_first_that_it_has_ended() -
     assert len(recorder.channel.of("ended")) == 1
 
 
-def test_a_recorder_that_stores_what_it_is_given_makes_progress_though_one_stream_is_behind() -> None:
+def test_recorder_progresses_while_one_stream_lags() -> None:
     """On a slow disk: the run is not stuck."""
     recorder = Recorder()
     recorder.process.frontiers[STREAM] = 0

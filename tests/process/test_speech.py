@@ -37,7 +37,7 @@ def test_any_text_comes_through_on_one_line(text: str, level: str, source: str) 
 
 
 @given(st.text(max_size=50).filter(lambda text: "\n" not in text))
-def test_what_is_no_line_of_ours_is_text(text: str) -> None:
+def test_line_without_the_log_format_is_plain_text(text: str) -> None:
     assert heard(text, "p", ()).level == "info"
     assert heard(text, "p", ()).text == text.removeprefix(MARK)
     assert heard(MARK + json.dumps(["x"]), "p", ()).text == '["x"]'
@@ -83,7 +83,7 @@ def test_prints_become_whole_lines_and_the_rest_at_a_flush() -> None:
     assert [heard(line, "p", ()).text for line in piped(speak)] == ["one", "two and more", "rest"]
 
 
-def test_a_logger_whose_arguments_do_not_fit_is_heard_all_the_same(monkeypatch) -> None:
+def test_log_record_with_unfit_arguments_is_still_logged(monkeypatch) -> None:
     said: list[str] = []
     monkeypatch.setattr("dataflow.process.log_pipe._say", lambda *fields, operator: said.append(fields[2]))
     _Handler().emit(logging.LogRecord("n", logging.WARNING, "f.py", 3, "%d apples", ("no",), None))

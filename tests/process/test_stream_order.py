@@ -30,7 +30,7 @@ def take_all(order: StreamOrder, envelopes: Sequence[Envelope]) -> tuple[list[En
 
 
 @given(st.integers(3, 8), st.data())
-def test_what_was_lost_is_said_once_and_the_rest_is_taken(count: int, data: st.DataObject) -> None:
+def test_gap_is_reported_once_and_the_rest_is_taken(count: int, data: st.DataObject) -> None:
     own = stream_of(count)
     first = data.draw(st.integers(1, len(own) - 2))
     following = data.draw(st.integers(first, len(own) - 1))
@@ -44,7 +44,7 @@ def test_what_was_lost_is_said_once_and_the_rest_is_taken(count: int, data: st.D
 
 
 @given(st.integers(1, 6).map(stream_of), st.data())
-def test_what_contradicts_a_stream_changes_nothing(own: list[Envelope], data: st.DataObject) -> None:
+def test_contradicting_envelopes_change_nothing(own: list[Envelope], data: st.DataObject) -> None:
     """Places that are past, and the end of time."""
     order = StreamOrder()
     taken: list[Envelope] = []
@@ -74,7 +74,7 @@ def test_a_new_incarnation_is_believed_at_once_and_the_one_before_is_over() -> N
     assert order.take(message(1, 510, incarnation=1)).taken
 
 
-def test_what_a_new_incarnation_lost_first_is_said_once() -> None:
+def test_initial_gap_of_a_new_incarnation_is_reported_once() -> None:
     order = StreamOrder()
     take_all(order, [message(0), message(1)])
 
@@ -82,7 +82,7 @@ def test_what_a_new_incarnation_lost_first_is_said_once() -> None:
     assert take_all(order, later) == (later, [(0, 3)])
 
 
-def test_a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost() -> None:
+def test_frontier_from_a_successor_reveals_messages_lost_of_its_predecessor() -> None:
     said_by_successor = frontier(4, NEVER)
 
     order = StreamOrder((0, 0))

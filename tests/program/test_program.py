@@ -72,7 +72,7 @@ def test_messages_of_every_type_come_back_bit_for_bit_from_cpp(relay: Relay) -> 
         assert outputs["count"] == Number(stamp=message.stamp, value=5.0, unit="messages")
 
 
-def test_a_large_message_comes_back(relay: Relay) -> None:
+def test_large_message_is_returned_by_the_program(relay: Relay) -> None:
     message = Image(stamp=1, frame="camera", data=np.arange(1200 * 1600 * 3, dtype=np.uint8).reshape(1200, 1600, 3))
     assert call(relay, 1, message=message)["back"].digest() == message.digest()
 
@@ -157,7 +157,7 @@ def test_a_run_in_processes_verifies_and_a_changed_program_is_named(
         ("half", r"python\S* ended with exit code 3 in process\(\) at 7"),
     ],
 )
-def test_what_is_no_reply_ends_the_program(fault: str, text: str) -> None:
+def test_malformed_reply_ends_the_program(fault: str, text: str) -> None:
     with started(faulty(fault)()) as operator, pytest.raises(ProgramError, match=text):
         call(operator, 7, number=number(7))
 

@@ -52,7 +52,7 @@ CODES = {
 
 @pytest.mark.parametrize("pattern", CODES)
 @pytest.mark.parametrize("shape", [(6, 8), (7, 9), (3, 3)])
-def test_bayer_mosaics_are_what_opencv_makes_of_them(pattern: str, shape: tuple[int, int]) -> None:
+def test_bayer_mosaics_are_converted_as_by_opencv(pattern: str, shape: tuple[int, int]) -> None:
     mosaic = RANDOM.integers(0, 256, shape).astype(np.uint8)
     deep = RANDOM.integers(0, 65536, shape).astype("<u2")
 
@@ -84,7 +84,7 @@ def test_bayer_mosaic_of_one_colour_gives_that_colour_back(pattern: str) -> None
         ("yuv422_yuy2", cv2.COLOR_YUV2RGB_YUY2),
     ],
 )
-def test_packed_yuv_is_what_opencv_makes_of_it(encoding: str, code: int) -> None:
+def test_packed_yuv_is_converted_as_by_opencv(encoding: str, code: int) -> None:
     stored = RANDOM.integers(0, 256, (64, 64, 2)).astype(np.uint8)
 
     np.testing.assert_array_equal(as_image(encoding, rows(encoding, stored)), cv2.cvtColor(stored, code))
@@ -92,7 +92,7 @@ def test_packed_yuv_is_what_opencv_makes_of_it(encoding: str, code: int) -> None
 
 @pytest.mark.parametrize(("encoding", "code"), [("nv12", cv2.COLOR_YUV2RGB_NV12), ("nv21", cv2.COLOR_YUV2RGB_NV21)])
 @pytest.mark.parametrize("padding", [0, 6])
-def test_planar_yuv_is_what_opencv_makes_of_it(encoding: str, code: int, padding: int) -> None:
+def test_planar_yuv_is_converted_as_by_opencv(encoding: str, code: int, padding: int) -> None:
     stored = RANDOM.integers(0, 256, (48, 64 + padding)).astype(np.uint8)
     width = 64
 
@@ -121,7 +121,7 @@ def test_16_bit_colours_lose_their_alpha_channel_alone(encoding: str) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "kind"), [("16SC1", "signed"), ("32FC3", "3 channels"), ("8UC2", "2 channels")])
-def test_arrays_of_opencv_that_are_no_picture_are_refused_with_what_would_be(encoding: str, kind: str) -> None:
+def test_opencv_arrays_that_are_no_image_are_refused_with_valid_encodings(encoding: str, kind: str) -> None:
     with pytest.raises(RecordingError, match=f"{kind}.* is no image or depth here: 16UC1"):
         stored_rows(encoding, 4, 2, 0, np.zeros(500, np.uint8))
 
@@ -145,7 +145,7 @@ def test_padding_that_the_last_row_lacks_takes_no_memory() -> None:
     assert stored_rows("mono8", 3, 1, 1 << 62, row).tolist() == [[0, 1, 2]]
 
 
-def test_what_does_not_fit_is_refused_with_its_numbers() -> None:
+def test_mismatched_pixels_are_refused_with_their_numbers() -> None:
     with pytest.raises(RecordingError, match="needs rows of 12 bytes, got step 12 and 5 bytes"):
         stored_rows("rgb8", 4, 2, 0, np.zeros(5, np.uint8))
     with pytest.raises(RecordingError, match="'h264' is not known; those known are mono8"):

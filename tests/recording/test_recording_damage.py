@@ -126,7 +126,7 @@ def unsealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
-def test_no_flipped_bit_changes_what_is_read_silently(recording: Path, seed: int) -> None:
+def test_flipped_bits_never_change_messages_silently(recording: Path, seed: int) -> None:
     assert silent_changes(recording, seed=seed) == []
 
 
@@ -238,7 +238,7 @@ def test_an_index_that_disagrees_with_the_statistics_is_not_believed(
         assert [m.stamp for m in recording.messages()] == [1, 2, 3, 4, 5]
 
 
-def test_a_seal_tells_every_change_of_its_record() -> None:
+def test_seal_detects_every_change_of_its_record() -> None:
     record = sealed(b"\x04" + struct.pack("<Q", 3) + b"abc")
     assert seal_of(record) is Seal.SOUND
     assert struct.unpack_from("<BQ", record) == (4, len(record) - 9)

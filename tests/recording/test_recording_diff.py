@@ -116,7 +116,7 @@ def test_without_a_tolerance_negative_zero_and_nan_payloads_count(record: Callab
     assert (stream.outcome, stream.max_difference) == ("different", 0.0)
 
 
-def test_absent_fields_and_types_are_told_apart(record: Callable[..., Path]) -> None:
+def test_absent_fields_and_other_types_are_reported_as_differences(record: Callable[..., Path]) -> None:
     scan = LaserScan(stamp=1, frame="l", angle_min=0.0, angle_max=1.0, ranges=[1.0], intensities=[5.0])
     stream = one(record, scan, scan.replace(intensities=None), 1.0)
     assert stream.first is not None

@@ -150,7 +150,7 @@ def test_json_keeps_the_shape_of(shape: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("elements", [LONG_BYTES // 8 - 1, LONG_BYTES // 8, LONG_BYTES], ids="{} elements".format)
 @pytest.mark.parametrize("text", ["\0", '"base64":"\0"', '\\u0000","base64":"', "plain"])
-def test_json_of_long_arrays_is_what_the_encoder_would_write(elements: int, text: str) -> None:
+def test_json_of_long_arrays_equals_that_of_the_encoder(elements: int, text: str) -> None:
     numbers, octets = np.linspace(0, 1, elements), np.arange(elements, dtype=np.uint8)
     message = Long(stamp=3, base64=text, before=octets, words=[text] * 2, after=numbers, number=2**60)
     [data], _ = codec_for(Long).encode(message)

@@ -71,7 +71,7 @@ def test_without_the_module_messages_have_the_same_fields_and_digests(path: Path
 
 
 @pytest.mark.usefixtures("unknown")
-def test_what_is_written_without_the_module_is_the_same_file(path: Path, tmp_path: Path) -> None:
+def test_file_written_without_the_module_is_identical(path: Path, tmp_path: Path) -> None:
     with Recording(path) as recording:
         again = write(tmp_path / "again.mcap", [m.message for m in recording.messages()])
     assert again.read_bytes() == path.read_bytes()

@@ -150,9 +150,7 @@ def test_a_part_that_its_writer_died_as_it_began_is_passed_over(folder: Path, tm
             assert recording.digests() == expected.digests()
 
 
-def test_what_a_file_declares_is_parsed_once_however_often_it_is_opened(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_declarations_of_a_file_are_parsed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(stream: ReadDataStream) -> Channel:
         raise AssertionError("a channel is parsed again")
 

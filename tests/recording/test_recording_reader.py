@@ -365,9 +365,7 @@ def test_foxglove_json_becomes_our_messages(data_dir: Path) -> None:
     assert calibration.distortion.tolist() == first["D"]
 
 
-def test_a_recording_of_a_newer_format_is_refused_with_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recording_of_a_newer_format_is_refused_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.recording.streams.writer.FORMAT", "2")
     path = recorded(tmp_path / "newer.mcap", [("robot1/a/pose", pose(1))], namespace="robot1")
     with pytest.raises(RecordingError, match=r"format '2'.*reads format '1'.*newer"):

@@ -162,9 +162,7 @@ def test_the_end_of_a_file_is_one_write(tmp_path: Path, monkeypatch: pytest.Monk
         assert len(list(recording.messages())) == 40
 
 
-def test_what_a_file_declares_goes_to_the_disk_with_its_first_messages_in_one_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_declarations_and_first_messages_share_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a write for each schema, channel and metadata, a part of a recording began with forty."""
     writes = noted_writes(monkeypatch)
     writer = RecordingWriter(tmp_path / "many.mcap", metadata={"graph": {"text": "graph: g"}})
@@ -181,9 +179,7 @@ def test_what_a_file_declares_goes_to_the_disk_with_its_first_messages_in_one_wr
     writer.close()
 
 
-def test_what_a_refused_write_would_have_declared_is_not_in_the_index(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_declarations_of_a_failed_write_are_not_in_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "full.mcap"
     writer = RecordingWriter(path, metadata={"graph": {"text": "graph: g"}})
     writer.add_stream("kept", Pose)

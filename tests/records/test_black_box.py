@@ -39,7 +39,7 @@ def test_a_new_black_box_is_empty(memory: int) -> None:
     assert read_black_box(memory, PORTS).reached == {"camera": OperatorProgress(), "detector": OperatorProgress()}
 
 
-def test_what_is_written_is_read_by_operator(memory: int) -> None:
+def test_black_box_records_are_read_back_by_operator(memory: int) -> None:
     box = BlackBox(memory, PORTS)
     for index in range(5):
         box.add(record(index))
@@ -85,7 +85,7 @@ def test_records_that_grow_take_no_more_memory_than_the_latest_ones(memory: int)
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 3000), min_size=1, max_size=60))
-def test_whatever_the_sizes_what_remains_is_the_end_without_gaps(sizes: list[int]) -> None:
+def test_black_box_keeps_the_latest_records_without_gaps(sizes: list[int]) -> None:
     memory = make_black_box()
     try:
         with pytest.MonkeyPatch.context() as patch:

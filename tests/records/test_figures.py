@@ -28,7 +28,7 @@ def test_figures_of_one_name_in_several_units_have_one_line() -> None:
     assert list(figures(score)) == ["matched", "rpe 1s rmse", "rpe 1m rmse", "alignment"]
 
 
-def test_a_recording_tells_what_operators_summed_up_when_they_last_ended(tmp_path: Path) -> None:
+def test_recorded_summaries_are_those_of_the_last_finish(tmp_path: Path) -> None:
     calls = [FiringRecord("score", 0, 0, "fire", 5)]
     ends = [FiringRecord("score", i, 1, "finish", 9, detail={"summary": {"matched": 3 + i}}) for i in range(2)]
     with RecordingWriter(tmp_path / "a.mcap", metadata={}) as writer:

@@ -95,7 +95,7 @@ def test_records_before_the_window_are_not_read_and_a_cut_stands_for_them(tmp_pa
         ({"told": False}, None),  # an older recording
     ],
 )
-def test_the_window_has_what_is_needed_or_all_is_read(
+def test_window_covers_the_needed_records_or_all_are_read(
     options: dict[str, int], first: int | None, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.mcap"

@@ -173,7 +173,7 @@ def test_a_part_of_a_message_can_be_sent_as_its_type() -> None:
     assert written(Number(stamp=1, value=3.0, unit=""), "std_msgs/msg/UInt8", "jazzy")[2] == b"\0\1\0\0\3"
 
 
-def test_what_cannot_be_sent_is_named() -> None:
+def test_unsendable_message_is_refused_with_the_reason() -> None:
     odometry = example(Odometry, 1).replace(stamp=5)
     for message, kind, said in (
         (odometry, "sensor_msgs/msg/Imu", "is sent as nav_msgs/msg/Odometry or its parts"),

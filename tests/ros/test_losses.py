@@ -33,7 +33,7 @@ def test_publishers_are_counted_apart_and_a_restart_is_a_new_one() -> None:
     assert losses.publishers[OTHER].lost == losses.lost == 1
 
 
-def test_a_publisher_that_begins_anew_under_its_old_gid_has_lost_nothing() -> None:
+def test_publisher_restarted_with_its_gid_has_lost_nothing() -> None:
     losses = Losses()
     losses.take(sent(50))
     assert [losses.take(sent(n, start=10**9)) for n in (1, 2, 4)] == [0, 0, 1]
@@ -68,7 +68,7 @@ def test_publishers_are_forgotten_when_there_are_too_many_and_their_losses_stay(
 
 
 @given(st.data())
-def test_lost_is_what_never_came_whatever_came_late_or_twice(data: st.DataObject) -> None:
+def test_lost_messages_are_counted_despite_late_and_repeated_ones(data: st.DataObject) -> None:
     numbers = data.draw(st.sets(st.integers(2, 40)))
     order = data.draw(st.permutations([*numbers, *data.draw(st.lists(st.sampled_from(sorted(numbers or {1}))))]))
     losses = Losses()

@@ -13,7 +13,7 @@ def sent(number: int) -> Attachment:
     return Attachment(number, 1000 * number, b"a" * 16)
 
 
-def test_it_gives_what_came_in_order_and_ends_when_it_is_closed() -> None:
+def test_mailbox_returns_arrivals_in_order_and_ends_when_closed() -> None:
     box = Mailbox()
     box.clock = 7
     box.sample(b"a", sent(1).encoded())
@@ -28,7 +28,7 @@ def test_it_gives_what_came_in_order_and_ends_when_it_is_closed() -> None:
     assert box.closed
 
 
-def test_what_does_not_fit_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mailbox_overflow_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mailbox, "MOST_BYTES", 10)
     box = Mailbox()
     for size in (6, 5, 4):
@@ -43,7 +43,7 @@ def test_what_does_not_fit_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert box.overflow == 2
 
 
-def test_what_does_not_fit_is_not_lost_on_the_side_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mailbox_overflow_is_not_counted_as_ros_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mailbox, "MOST", 2)
     box = Mailbox()
     for number in (1, 2, 3, 4):

@@ -45,7 +45,7 @@ def test_names_and_endpoints_that_cannot_be_are_faults_of_the_graph(name: str, v
     load_text(text % {"namespace": "/robot_1/arm", "node": "eyes", "router": "tls/[::1]:7447"}[name])
 
 
-def test_what_ros_takes_is_taken() -> None:
+def test_valid_ros_topic_names_are_accepted() -> None:
     for topic in ("imu", "/imu", "/robot/imu_1/data", "~/imu"):
         load_text(GRAPH % (topic, "sensor_msgs/msg/Imu"))
 

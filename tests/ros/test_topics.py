@@ -135,7 +135,7 @@ def test_types_without_a_counterpart_are_passed_on_as_they_are(endpoint: str, pe
         topics.Imu(topic="/gripper", router=endpoint).setup()
 
 
-def test_a_late_subscriber_gets_what_was_latched_and_both_publishers_count(endpoint: str, peer: Peer) -> None:
+def test_late_subscriber_receives_latched_messages_of_both_publishers(endpoint: str, peer: Peer) -> None:
     with Peer(endpoint, "second") as second:
         hash_ = JAZZY.hash_rihs01(TF)
         one, two = (each.publisher("/tf_static", TF, hash_, latched=1) for each in (peer, second))
@@ -150,7 +150,7 @@ def test_a_late_subscriber_gets_what_was_latched_and_both_publishers_count(endpo
             assert source.summary()["lost"] == 0
 
 
-def test_what_a_sink_latches_comes_to_late_subscribers_of_ros(endpoint: str, peer: Peer) -> None:
+def test_latched_messages_reach_late_ros_subscribers(endpoint: str, peer: Peer) -> None:
     sink = Ros2Sink(
         topic="notice", namespace="/robot", router=endpoint, durability="transient_local", depth=1, node="dash"
     )
@@ -232,7 +232,7 @@ def test_definitions_are_read_before_messages_come(endpoint: str, monkeypatch: p
     assert read == [("std_msgs/msg/String", STRING), ("", "subscribed")]
 
 
-def test_errors_name_what_is_missing(endpoint: str, peer: Peer) -> None:
+def test_errors_name_the_missing_publisher_type_or_message(endpoint: str, peer: Peer) -> None:
     talker = peer.publisher("/chatter", "std_msgs/msg/String", STRING)
     with pytest.raises(SourceError, match=r"no publisher of /scan in domain 0 within 0.2 s; topics there: .*/chatter"):
         topics.LaserScan(topic="/scan", router=endpoint, within="200ms").setup()

@@ -67,7 +67,7 @@ def test_other_tokens_are_refused(token: str) -> None:
         End.decoded(token)
 
 
-def test_what_later_versions_add_to_a_token_is_passed_over() -> None:
+def test_unknown_token_parts_of_later_versions_are_ignored() -> None:
     assert End.decoded(f"{TOKEN}/cpu:") == SCAN
 
 

@@ -64,7 +64,7 @@ def test_type_hashes_are_those_of_another_implementation(distro: Any) -> None:
         assert get_type_hash(type_, msg_definition=text, dependencies=parts) == type_hash(type_, distro), type_
 
 
-def test_what_the_other_side_publishes_comes_and_its_losses_are_counted(endpoint: dict[str, Any]) -> None:
+def test_messages_of_a_ros2_publisher_arrive_and_losses_are_counted(endpoint: dict[str, Any]) -> None:
     talker = sdk.ROS2Publisher("/chatter", STRING, "string data\n", node_name="talker", **endpoint["there"])
     with Read(topics.Text(topic="/chatter", router=endpoint["router"])) as read:  # type and hash from its token
         until(lambda: talker.pub.matching_status.matching)
@@ -78,7 +78,7 @@ def test_what_the_other_side_publishes_comes_and_its_losses_are_counted(endpoint
     talker.close()
 
 
-def test_what_is_published_here_comes_to_the_other_side(endpoint: dict[str, Any]) -> None:
+def test_published_messages_arrive_at_the_ros2_subscriber(endpoint: dict[str, Any]) -> None:
     said, seen = list[Any](), list[Any]()
     chatter = sdk.ROS2Subscriber("/chatter", STRING, said.append, "string data\n", **endpoint["there"])
     images = sdk.ROS2Subscriber("/camera", IMAGE, seen.append, **endpoint["there"])
@@ -102,7 +102,7 @@ def test_what_is_published_here_comes_to_the_other_side(endpoint: dict[str, Any]
     images.close()
 
 
-def test_a_late_subscriber_of_the_other_side_gets_what_was_latched_here(endpoint: dict[str, Any]) -> None:
+def test_late_ros2_subscriber_receives_the_latched_message(endpoint: dict[str, Any]) -> None:
     from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
     sink = Ros2Sink(topic="/robot_description", type=STRING, router=endpoint["router"], durability="transient_local")

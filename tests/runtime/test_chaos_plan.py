@@ -47,7 +47,7 @@ def test_the_timeline_is_in_the_order_of_time_and_as_dense_as_asked(graph: Graph
     assert [f for f in faults if f.kind == "slow"] == [Fault(1.0, "slow", "mix", {"by": 0.03, "span": 0.2})]
 
 
-def test_what_an_entry_does_does_not_depend_on_the_entries_after_it(graph: Graph) -> None:
+def test_entry_is_independent_of_later_entries(graph: Graph) -> None:
     alone = timeline(graph, KILL)
     together = timeline(graph, KILL, TUNE, SLOW)
 
@@ -55,7 +55,7 @@ def test_what_an_entry_does_does_not_depend_on_the_entries_after_it(graph: Graph
     assert timeline(graph, {**KILL, "until": "5s"}) == [f for f in alone if f.at <= 5.0]
 
 
-def test_a_plan_file_has_a_seed_of_its_own_which_may_be_replaced(graph: Graph, tmp_path: Path) -> None:
+def test_seed_of_a_plan_file_may_be_overridden(graph: Graph, tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text("seed: 3\nfaults:\n  - {kind: kill, operator: smooth, every: 700ms}\n")
 
@@ -85,13 +85,13 @@ def test_a_plan_file_has_a_seed_of_its_own_which_may_be_replaced(graph: Graph, t
         ({"kind": "malformed", "operator": "left", "at": "1s", "size": 3}, "faults.0.size: unknown key 'size'"),
     ],
 )
-def test_a_plan_that_cannot_be_followed_says_which_entry_and_why(graph: Graph, entry: Any, words: str) -> None:
+def test_invalid_plan_error_names_the_entry_and_reason(graph: Graph, entry: Any, words: str) -> None:
     with pytest.raises(ChaosError) as caught:
         plan_of({"faults": [entry]}, graph)
     assert words in str(caught.value)
 
 
-def test_what_nothing_would_outlive_is_refused() -> None:
+def test_fatal_fault_without_restart_policy_is_refused() -> None:
     fragile = load_graph(HERE / "live.yaml", live=True)
 
     with pytest.raises(ChaosError, match="'kill' would end the run; give 'smooth' a restart policy"):
@@ -141,7 +141,7 @@ def test_a_source_that_nothing_is_done_to_is_left_alone(stamp: int, now: float) 
     assert stamps(SourceFaults(), stamp, now) == [stamp]
 
 
-def test_what_is_done_to_a_source_ends_when_it_should() -> None:
+def test_source_faults_end_on_time() -> None:
     faults = SourceFaults()
     faults.begin("stop", {"span": 1.0}, 10.0)
     assert [stamps(faults, 5, t) for t in (10.0, 10.9, 11.1)] == [[], [], [5]]

@@ -65,7 +65,7 @@ def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
 
 
 @pytest.mark.long
-def test_a_process_that_is_started_again_after_its_sources_have_ended_ends_in_order(tmp_path: Path) -> None:
+def test_process_restarted_after_its_sources_ended_ends_in_order(tmp_path: Path) -> None:
     """The recorder has their ends, and is told to expect them again: what came in 0.5 s keeps `slow` busy for 3 s, and
     its hang comes well within these."""
     text = (HERE / "chaos.yaml").read_text()

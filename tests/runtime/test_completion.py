@@ -78,7 +78,7 @@ def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_veri
 
 
 @pytest.mark.long
-def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_be_completed(tmp_path: Path) -> None:
+def test_recording_of_sensors_only_can_be_completed(tmp_path: Path) -> None:
     graph = _recording_sensors_only(load_graph(HERE / "mixed.yaml", settings=["count=40"]))
     path, out = tmp_path / "thin.mcap", tmp_path / "out.mcap"
     full = run(graph, placement="one_process", record=path)
@@ -92,7 +92,7 @@ def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_b
     assert replay_recording(out, placement="one_process").digests() == full.digests()
 
 
-def test_what_acts_on_the_world_needs_nothing_to_complete_a_recording(tmp_path: Path) -> None:
+def test_acting_operator_is_not_needed_to_complete_a_recording(tmp_path: Path) -> None:
     """It does not act again, so what it alone took may be missing."""
     graph = load_text("""
 graph: acting
@@ -117,7 +117,7 @@ def _recording_sensors_only(graph: Graph) -> Graph:
 
 
 @pytest.mark.long
-def test_code_that_changed_since_completes_nothing_and_says_where(live: Path, tmp_path: Path) -> None:
+def test_changed_code_completes_nothing_and_names_the_operator(live: Path, tmp_path: Path) -> None:
     graph = load_graph(HERE / "live.yaml", live=True)
     smooth = graph.nodes["smooth"]
     changed = replace(graph, nodes={**graph.nodes, "smooth": replace(smooth, use="runtime_operators:SmoothChanged")})
@@ -144,7 +144,7 @@ def test_lines_of_the_log_that_came_in_one_call_are_taken_over(live: Path, tmp_p
         assert list(a.logs()) == list(b.logs())
 
 
-def test_what_is_not_to_be_had_is_not_made_up(live: Path, tmp_path: Path) -> None:
+def test_unavailable_streams_are_not_completed(live: Path, tmp_path: Path) -> None:
     short = thin(live, tmp_path / "short.mcap", keep=0.5)
 
     made = complete(short, tmp_path / "out.mcap")

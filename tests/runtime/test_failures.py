@@ -223,7 +223,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
 
 
 @pytest.mark.long
-def test_what_operators_print_reaches_the_user() -> None:
+def test_output_of_operators_reaches_the_user() -> None:
     said: list[tuple[str, str]] = []
 
     Supervisor(RunPlan(broken("chatter")), on_output=lambda label, line: said.append((label, line))).run()

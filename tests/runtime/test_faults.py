@@ -97,7 +97,7 @@ SMOOTH = f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, li
 FALLBACK = "{}: {{use: faulty_operators:Fallback, inputs: {{x: left/fast, other: smooth/mean}}{}}}"
 
 
-def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path) -> None:
+def test_crashed_process_is_replaced_while_the_rest_continues(path: Path) -> None:
     graph = robot(
         SMOOTH,
         FALLBACK.format("other", ""),
@@ -121,7 +121,7 @@ def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path)
 
 
 @pytest.mark.long
-def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(path: Path) -> None:
+def test_crashed_source_is_restarted_at_the_current_time(path: Path) -> None:
     ran = Ran(robot(SMOOTH, count=250), path, {"kind": "kill", "operator": "left", "at": "300ms"})
 
     assert ran.report.restarts == {"left": 1}
@@ -133,7 +133,7 @@ def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(p
 
 
 @pytest.mark.long
-def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+def test_operator_that_raises_is_recreated_in_the_same_process(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 
     assert ran.report.restarts == {"smooth": 1}
@@ -315,7 +315,7 @@ def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None
 
 
 @pytest.mark.long
-def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -> None:
+def test_source_drops_are_counted_by_reason_in_report_and_recording(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, params: {sleep: 0.05}, inputs: {x: left/fast}, live: {queue: block}}",
         count=250,
@@ -331,7 +331,7 @@ def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -
 
 
 @pytest.mark.long
-def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -> None:
+def test_drops_of_a_killed_process_stay_counted(path: Path) -> None:
     graph = robot(
         f"slow: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{queue: newest, size: 1, {AGAIN}}}}}",
         count=250,
@@ -348,7 +348,7 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
 
 
 @pytest.mark.long
-def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
+def test_source_slower_than_the_clock_is_reported_at_once_and_at_the_end(path: Path) -> None:
     graph = graph_of(
         "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
         "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
@@ -362,7 +362,7 @@ def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Pat
     assert "s behind the clock at the end" in ran.report.notes[-1]
 
 
-def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:
+def test_clock_jump_back_starts_an_incarnation_and_resets_operators(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
     ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "300ms", "at": "500ms"})
@@ -376,7 +376,7 @@ def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(pat
 
 
 @pytest.mark.long
-def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late(path: Path) -> None:
+def test_replay_after_a_clock_jump_back_drops_repeated_stamps_as_late(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 100}}",
         "both: {use: faulty_operators:Fallback, inputs: {x: left/fast, other: right/fast}}",
@@ -394,7 +394,7 @@ def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late
 
 
 @pytest.mark.long
-def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
+def test_clock_jump_ahead_continues_the_incarnation(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
     ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "10s", "back": False, "at": "500ms"})
@@ -432,7 +432,7 @@ def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+def test_source_that_raises_is_recreated_in_the_same_process(path: Path) -> None:
     graph = graph_of(
         f"camera: {{use: faulty_operators:Camera, live: {{{AGAIN}}}}}",
         "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}",

@@ -94,7 +94,7 @@ def test_a_recording_that_may_not_grow_ends_the_run_and_stays_readable(tmp_path:
 
 
 @pytest.mark.long
-def test_a_run_goes_on_without_its_recording_and_says_what_is_lost(tmp_path: Path) -> None:
+def test_run_continues_on_a_full_disk_and_reports_the_loss(tmp_path: Path) -> None:
     graph_file(tmp_path, count=600, source="faulty_operators:Noise")
     (tmp_path / "small").mkdir()
 
@@ -182,7 +182,7 @@ operators:
 
 
 @pytest.mark.long
-def test_a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted(
+def test_stopped_consumer_delays_no_other_process_and_its_loss_is_counted(
     tmp_path: Path,
 ) -> None:
     """Messages of 1 MB: what it does not take is more than the memory that large messages lie in."""

@@ -74,7 +74,7 @@ def batches(draw: st.DrawFn) -> list[FiringRecord]:
 
 @given(batches(), st.booleans())
 @settings(max_examples=60, deadline=None)
-def test_a_batch_comes_back_as_it_was_written(records: list[FiringRecord], last: bool) -> None:
+def test_firing_batch_survives_encoding(records: list[FiringRecord], last: bool) -> None:
     batch = decode_batch(encode_batch(records, last=last))
 
     assert list(batch.records) == records

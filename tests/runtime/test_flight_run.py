@@ -66,7 +66,7 @@ def test_triggered_recording_is_kept_and_verifies(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_who_steers_the_run_has_it_keep_what_was(tmp_path: Path) -> None:
+def test_trigger_by_the_user_keeps_a_flight_recording(tmp_path: Path) -> None:
     @contextmanager
     def controls(supervisor: Supervisor) -> Iterator[None]:
         def press() -> None:
@@ -88,7 +88,7 @@ def test_who_steers_the_run_has_it_keep_what_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_operator_that_fails_keeps_what_led_to_it(tmp_path: Path) -> None:
+def test_failing_operator_triggers_a_flight_recording(tmp_path: Path) -> None:
     plan = {"faults": [{"kind": "raise", "operator": "first", "at": "1200ms"}]}
 
     _, files = flown(tmp_path, faults=plan)

@@ -147,7 +147,7 @@ def test_the_verdict_is_that_of_the_first_row_of_the_table_that_applies() -> Non
     assert met == set(table())
 
 
-def test_what_was_accepted_passes_and_only_that() -> None:
+def test_only_accepted_changes_pass() -> None:
     known = accepted({"a": None, "b": "x", "c": "y"})
     same = report({"a": None, "b": "x", "c": "y"}, CHAIN, culprits={"b"})
 
@@ -156,7 +156,7 @@ def test_what_was_accepted_passes_and_only_that() -> None:
     assert verdicts(judge(other, known))["b"] == "culprit"
 
 
-def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_differ_from_the_recording() -> None:
+def test_new_change_downstream_of_an_accepted_one_is_a_culprit() -> None:
     known = accepted({"a": None, "b": "x", "c": "y"})
 
     found = judge(report({"a": None, "b": "x", "c": "new"}, CHAIN, culprits={"b"}), known)
@@ -164,7 +164,7 @@ def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_di
     assert verdicts(found) == {"a": "identical", "b": "accepted", "c": "culprit"}
 
 
-def test_what_follows_from_a_new_change_is_downstream_of_it() -> None:
+def test_consequences_of_a_new_change_are_downstream() -> None:
     known = accepted({"a": "x", "b": "x", "c": "x"})
 
     found = judge(report({"a": "x", "b": "new", "c": "new"}, CHAIN, culprits={"a"}), known)
@@ -188,7 +188,7 @@ def test_an_accepted_change_that_is_gone_does_not_pass_unseen() -> None:
     assert not Checked(Path("x"), "x", report({}, {}), found).passed
 
 
-def test_what_could_not_be_repeated_never_passes_and_is_never_accepted(tmp_path: Path) -> None:
+def test_unverifiable_operator_neither_passes_nor_is_accepted(tmp_path: Path) -> None:
     made = report({"a": None}, {})
     made.operators[0].unverifiable = 2
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
@@ -200,7 +200,7 @@ def test_what_could_not_be_repeated_never_passes_and_is_never_accepted(tmp_path:
 
 
 @pytest.mark.parametrize("part", ["unverifiable", "lost_records"])
-def test_what_differs_and_could_not_be_repeated_in_part_is_not_accepted(tmp_path: Path, part: str) -> None:
+def test_partly_unverifiable_difference_is_not_accepted(tmp_path: Path, part: str) -> None:
     made = report({"a": "x", "b": "y"}, CHAIN, culprits={"a"})
     setattr(made.operators[0], part, 2)
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
@@ -223,7 +223,7 @@ def test_an_accepted_outcome_does_not_pass_where_it_could_not_be_repeated_in_par
     assert not found[0].passed
 
 
-def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
+def test_consequences_of_an_unrepeatable_operator_are_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x", "b": "y", "c": None}, CHAIN, culprits={"a"})
     made = replace(made, repeated={"a": False})
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
@@ -231,7 +231,7 @@ def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(t
     assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a", "b"])
 
 
-def test_what_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
+def test_unrepeatable_operator_is_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x"}, {})
     made = replace(made, repeated={"a": False})
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
@@ -288,7 +288,7 @@ def test_a_folder_stands_for_all_its_recordings_each_once(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "error", [ReplayError("no sensors"), RunFailed("process died", "its last words"), KeyError("a fault of ours")]
 )
-def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Exception) -> None:
+def test_error_of_one_recording_is_its_result(error: Exception) -> None:
     def broken(path: Path) -> VerifyReport:
         raise error
 

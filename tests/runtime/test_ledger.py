@@ -124,7 +124,7 @@ def test_an_operator_of_which_nothing_lies_before_the_cut_is_not_verified(record
     assert of(verify(failed, only=["smooth"]), "smooth").verdict == "unverifiable"
 
 
-def test_firings_that_need_what_lies_after_the_cut_are_counted_apart(recorded: Path, tmp_path: Path) -> None:
+def test_firings_needing_messages_after_the_cut_are_counted_apart(recorded: Path, tmp_path: Path) -> None:
     half = rewritten(
         recorded,
         tmp_path / "half.mcap",
@@ -164,7 +164,7 @@ def test_made_messages_that_the_recording_lacks_are_counted(recorded: Path, tmp_
     assert of(report, "smooth").not_stored > 3
 
 
-def test_completing_keeps_what_cannot_be_made_again(recorded: Path, tmp_path: Path) -> None:
+def test_completing_keeps_messages_that_cannot_be_recomputed(recorded: Path, tmp_path: Path) -> None:
     path = rewritten(recorded, tmp_path / "tail.mcap", records=early("merge", 10))
 
     made = complete(path, tmp_path / "whole.mcap")
@@ -176,7 +176,7 @@ def test_completing_keeps_what_cannot_be_made_again(recorded: Path, tmp_path: Pa
         assert after.digests(["test/merge/seen"]) == before.digests(["test/merge/seen"])
 
 
-def test_a_sink_is_compared_by_what_it_sums_up(recorded: Path) -> None:
+def test_sink_is_compared_by_its_summary(recorded: Path) -> None:
     graph = load_graph(HERE / "mixed.yaml", settings=["count=60"])
     merge = replace(graph.nodes["merge"], use="verified_operators:MergeDoubled")
     total = replace(graph.nodes["sum"], use="verified_operators:SumHalved")
@@ -197,7 +197,7 @@ def test_a_sink_is_compared_by_what_it_sums_up(recorded: Path) -> None:
     ("more", "finished"),
     [(((1, 0, "setup"),), True), (((0, 99, "param"),), True), (((1, 0, "setup"), (1, 1, "fire")), False)],
 )
-def test_an_operator_that_has_finished_owes_no_second_end_unless_it_is_called_again(
+def test_finished_operator_needs_another_end_only_if_called_again(
     recorded: Path, more: tuple[tuple[int, int, Kind], ...], finished: bool
 ) -> None:
     """A parameter may change, and its process be restarted, while others are still at work."""
@@ -252,7 +252,7 @@ def test_an_operator_with_other_ports_than_recorded_is_named(recorded: Path) -> 
         verify(recorded, graph=replace(graph, nodes={**graph.nodes, "smooth": more}))
 
 
-def test_what_was_not_recorded_for_one_operator_is_made_again(recorded: Path, tmp_path: Path) -> None:
+def test_unrecorded_inputs_of_an_operator_are_recomputed(recorded: Path, tmp_path: Path) -> None:
     path = rewritten(recorded, tmp_path / "thin.mcap", stored=lambda stream, seq: stream != "test/mix/mixed")
 
     report = verify(path, only=["smooth"])

@@ -20,7 +20,7 @@ operators:
 
 
 @pytest.mark.long
-def test_what_is_left_out_is_filled_in_alike_in_every_placement(tmp_path: Path) -> None:
+def test_left_out_message_fields_are_completed_alike_in_every_placement(tmp_path: Path) -> None:
     file, path = tmp_path / "corner.yaml", tmp_path / "live.mcap"
     file.write_text(GRAPH, encoding="utf-8")
     graph = load_graph(file)

@@ -49,7 +49,7 @@ def test_live_runs_differ_so_verification_is_not_vacuous(tmp_path: Path) -> None
     assert len(digests) > 1
 
 
-def test_what_a_source_computes_counts_as_its_work() -> None:
+def test_cpu_time_of_a_source_is_counted() -> None:
     """In a live run it is read by a thread of its own."""
     graph = load_graph(HERE / "live.yaml", settings=["count=60"], live=True)
     source = SourceRunner(graph.nodes["left"], Outlets(), live=True)

@@ -55,7 +55,7 @@ def lines_of(path: Path) -> list[LogLine]:
         return [line for _, line in opened.logs()]
 
 
-def test_every_way_to_speak_is_recorded_with_level_operator_and_event_time(recorded) -> None:
+def test_log_lines_of_all_kinds_are_recorded_with_level_operator_and_event_time(recorded) -> None:
     said = [line for line in lines_of(recorded[0]) if line.stamp == FIRST]
 
     assert {(line.level, line.text, line.source) for line in said} >= {
@@ -70,7 +70,7 @@ def test_every_way_to_speak_is_recorded_with_level_operator_and_event_time(recor
     assert next(line for line in said if line.text == "word 1").file.endswith("talking_operators.py")
 
 
-def test_what_is_said_outside_of_firings_and_of_python_is_there_too(recorded) -> None:
+def test_log_lines_outside_of_firings_and_of_python_are_recorded(recorded) -> None:
     said = {line.text: line for line in lines_of(recorded[0])}
 
     assert (said["ready to talk"].operator, said["ready to talk"].stamp) == ("talker", None)

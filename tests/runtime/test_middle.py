@@ -48,7 +48,7 @@ def messages(path: Path) -> dict[str, dict[int, bytes]]:
 
 
 @pytest.mark.long
-def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded: Path, tmp_path: Path) -> None:
+def test_replay_from_the_middle_equals_the_whole_one_there(recorded: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.mcap"
 
     replay(recorded, start=0.5, placement="process_each", record=again)
@@ -85,7 +85,7 @@ def test_a_state_that_restores_to_something_else_is_found(recorded: Path, tmp_pa
 
 
 @pytest.mark.long
-def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_again(tmp_path: Path) -> None:
+def test_replay_from_the_middle_has_the_parameters_of_the_last_restart(tmp_path: Path) -> None:
     text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedAtStart")
     file, path = tmp_path / "chaos.yaml", tmp_path / "run.mcap"
     file.write_text(text)
@@ -161,7 +161,7 @@ def test_a_replay_that_begins_where_a_state_was_recorded_gives_nothing_twice(rec
 
 
 @pytest.mark.long
-def test_a_re_execution_from_the_middle_reads_only_what_it_needs(tmp_path: Path) -> None:
+def test_reexecution_from_the_middle_reads_only_needed_messages(tmp_path: Path) -> None:
     text = (
         (HERE / "chaos.yaml")
         .read_text()
@@ -220,7 +220,7 @@ def test_setting_up_is_no_part_of_the_time_of_a_re_execution(recorded: Path, mon
     assert 0.0 < work.wall < 100.0
 
 
-def test_what_an_operator_held_is_found_without_reading_the_whole_recording(
+def test_held_messages_are_found_without_reading_the_whole_recording(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph = load_graph(HERE / "chaos.yaml", settings=["count=120"])

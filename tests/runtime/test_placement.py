@@ -94,7 +94,9 @@ def test_replay_gives_the_same_digests_on_loaded_cores_with_operators_that_sleep
 
 @pytest.mark.long
 @pytest.mark.parametrize("window", [(1, 1), (3, 1 << 20)])
-def test_flow_control_cannot_change_what_fires(recording: tuple[Path, dict[str, str]], window: tuple[int, int]) -> None:
+def test_flow_control_does_not_change_the_digests(
+    recording: tuple[Path, dict[str, str]], window: tuple[int, int]
+) -> None:
     path, expected = recording
 
     assert replay(path, window=window).digests() == expected
@@ -140,9 +142,7 @@ def test_large_messages_arrive_whole(mixed: Graph) -> None:
 
 
 @pytest.mark.long
-def test_operators_of_nested_graphs_run_in_processes_of_their_own_and_are_seen_by_tools(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_operators_of_nested_graphs_run_in_separate_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     graph = load_graph(HERE / "outer.yaml")
 

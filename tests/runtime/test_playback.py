@@ -120,7 +120,7 @@ def test_a_playback_bar_moves_a_replay_through_a_graph(recorded: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_plain_run_whose_sources_are_in_two_processes_is_paused_stepped_and_paced(recorded: Path) -> None:
+def test_run_with_sources_in_two_processes_is_paused_stepped_and_paced(recorded: Path) -> None:
     graph = load_graph(HERE / "chaos.yaml", settings=["count=40"])
     answers: list[dict[str, Any]] = []
     given: list[dict[str, int]] = []
@@ -154,7 +154,7 @@ def test_a_plain_run_whose_sources_are_in_two_processes_is_paused_stepped_and_pa
     assert report.streams == replay(recorded, placement="one_process").streams
 
 
-def test_a_live_run_cannot_be_paused_and_says_why() -> None:
+def test_pausing_a_live_run_is_refused_with_the_reason() -> None:
     graph = load_graph(HERE / "chaos.yaml", settings=["count=400"], live=True)
     told: list[str] = []
 

@@ -58,7 +58,7 @@ def kill_recorder(supervisor: Supervisor) -> None:
 
 
 @pytest.mark.long
-def test_a_recorder_that_is_killed_is_followed_by_another_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_killed_recorder_is_replaced_and_the_run_continues(tmp_path: Path) -> None:
     report = ran(robot(250), kill_recorder, record=tmp_path / "run.mcap")
 
     assert report.operators["big"].firings == 250

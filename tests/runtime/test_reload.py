@@ -131,7 +131,7 @@ def _records(recording: Path, operator: str) -> list[Any]:
         return list(recorded_firings(opened, operator))
 
 
-def test_new_code_goes_on_with_the_state_and_the_run_verifies_identical(folder: Path) -> None:
+def test_reloaded_code_keeps_the_state_and_the_run_verifies_identical(folder: Path) -> None:
     outcomes: list[dict[str, Any]] = []
 
     def reload(processes: Processes) -> None:

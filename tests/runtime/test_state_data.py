@@ -154,7 +154,7 @@ def round_trip(state: State) -> State:
     return restored
 
 
-def test_every_kind_of_field_comes_back_as_it_was() -> None:
+def test_state_fields_of_every_kind_are_restored() -> None:
     state = filled()
 
     back = round_trip(state)
@@ -176,7 +176,7 @@ def plain_bytes(state: State) -> bytes:
 
 @settings(max_examples=60)
 @given(st.lists(st.integers(0, 100), min_size=1, max_size=12), st.integers(1, 5), st.integers(0, 12))
-def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: int, cut: int) -> None:
+def test_operator_restored_at_any_call_continues_identically(stamps: list[int], length: int, cut: int) -> None:
     whole, begun, later = (Averager(size=length) for _ in range(3))
     expected = [whole.process(number(s)).digest() for s in stamps]
     first = [begun.process(number(s)).digest() for s in stamps[:cut]]
@@ -189,7 +189,7 @@ def test_an_operator_restored_anywhere_goes_on_alike(stamps: list[int], length: 
     assert later.state.window.length == length
 
 
-def test_parts_with_settings_are_restored_where_they_are_and_made_by_their_owner_where_not() -> None:
+def test_state_parts_with_settings_are_restored_in_place() -> None:
     one, other = Ringing(), Ringing()
     one.process(number(1))
     first, second = other.state.rings
@@ -208,7 +208,7 @@ class Counting(Counts):
     empty: bool = False
 
 
-def test_a_count_that_was_begun_with_a_truth_value_comes_back() -> None:
+def test_counter_started_with_a_bool_is_restored() -> None:
     counting = Counting()
     counting.counts.update({"clouds without": True})
     packed = pack_state(plain(counting))
@@ -228,7 +228,7 @@ def test_room_for_growth_is_not_part_of_a_snapshot() -> None:
     assert (back.values.tolist(), back._used) == ([1.0, 2.0], 2)
 
 
-def test_a_reset_begins_anew_but_for_what_is_kept() -> None:
+def test_reset_clears_all_but_the_kept_state() -> None:
     operator = Averager()
     operator.process(number(3))
 
@@ -342,7 +342,7 @@ class Shelf(Generic[V]):
     by_id: dict[int, Kept[V]] = field(default_factory=dict)
 
 
-def test_a_generic_dataclass_comes_back_with_the_types_that_it_is_used_with() -> None:
+def test_generic_dataclass_is_restored_with_its_type_arguments() -> None:
     shelf = Shelf({1: Kept("there", Track(1, np.zeros(3))), 2: Kept("here")})
 
     back = typed(Shelf[Track], unpack_state(pack_state(plain(shelf))))
@@ -402,7 +402,7 @@ def test_a_state_is_seen_in_the_collections_that_it_declares() -> None:
     assert found["spare"] == ()
 
 
-def test_what_a_class_does_not_declare_is_seen_as_it_is() -> None:
+def test_undeclared_state_is_shown_unchanged() -> None:
     packed = {"tracks": [[1, 2]], "other": [[1, 2]], "seen": ["a"]}
 
     assert seen(State, packed) == {"tracks": [[1, 2]], "other": [[1, 2]], "seen": {"a"}}

@@ -47,7 +47,7 @@ def same(a: Any, b: Any) -> bool:
 
 @settings(max_examples=150)
 @given(states)
-def test_a_state_comes_back_bit_by_bit(state: dict[str, Any]) -> None:
+def test_state_is_restored_bit_for_bit(state: dict[str, Any]) -> None:
     assert same(unpack_state(pack_state(state)), state)
 
 
@@ -57,7 +57,7 @@ def test_equal_states_have_equal_bytes_whatever_the_order_of_their_keys(state: d
     assert pack_state(dict(reversed(state.items()))) == pack_state(state)
 
 
-def test_an_array_of_any_layout_comes_back_and_can_be_written_to() -> None:
+def test_array_of_any_layout_is_restored_and_writable() -> None:
     state = {"columns": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "part": np.arange(10)[::3]}
 
     restored = unpack_state(pack_state(state))
@@ -84,7 +84,7 @@ def test_numbers_of_numpy_come_back_as_arrays_without_dimensions() -> None:
         ({"names": np.array(["a", None], object)}, "state.names is a ndarray"),
     ],
 )
-def test_what_cannot_be_kept_is_named_with_its_place(state: dict[str, Any], words: str) -> None:
+def test_unpackable_state_is_refused_with_its_place(state: dict[str, Any], words: str) -> None:
     with pytest.raises(StateError, match=words):
         pack_state(state)
 
@@ -121,7 +121,7 @@ def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
         (None, {}, "none was recorded"),
     ],
 )
-def test_what_two_states_differ_in_is_said(recorded: Any, here: Any, words: str) -> None:
+def test_differing_fields_of_two_states_are_named(recorded: Any, here: Any, words: str) -> None:
     packed = [b"" if state is None else pack_state(state) for state in (recorded, here)]
 
     assert differing_fields(packed[0], packed[1]) == words

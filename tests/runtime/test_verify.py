@@ -54,7 +54,7 @@ def test_one_operator_is_verified_alone_with_its_inputs_taken_from_the_recording
     assert report.stood_in == ("mix",)
 
 
-def test_an_operator_and_what_follows_from_it(recorded: Path) -> None:
+def test_verify_first_covers_the_operator_and_its_downstream(recorded: Path) -> None:
     assert set(verdicts(verify(recorded, first="merge"))) == {"merge", "sum"}
 
 
@@ -123,7 +123,7 @@ def test_a_torn_recording_is_never_called_wholly_identical(recorded: Path, tmp_p
         assert report.cut or report.messages == 403  # the file lacks no more than its index
 
 
-def test_a_recording_without_what_is_needed_is_refused(recorded: Path) -> None:
+def test_verifying_sources_or_unknown_operators_is_refused(recorded: Path) -> None:
     with pytest.raises(ReplayError, match="'left' cannot be verified: it is a source"):
         verify(recorded, only=["left"])
     with pytest.raises(ReplayError, match="no operator of the graph; those that can: merge, mix, smooth, sum"):

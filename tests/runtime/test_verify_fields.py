@@ -98,7 +98,7 @@ def test_no_tolerance_covers_messages_where_there_were_none(recorded: Path) -> N
     assert (compared.beyond, compared.unpaired > 0) == (0, True)
 
 
-def test_what_only_follows_from_another_is_identical_when_given_the_recorded_inputs(recorded: Path) -> None:
+def test_downstream_operators_with_recorded_inputs_are_within_tolerance(recorded: Path) -> None:
     report = verified(recorded, "Nudged", tolerance=1e-5)
 
     differing = {v.operator for v in report.operators if v.first is not None} - {"smooth"}

@@ -48,7 +48,7 @@ def test_a_tap_sees_the_statics_first_and_then_the_messages_of_a_running_graph()
     assert not still_runs(found)
 
 
-def test_looking_for_a_graph_that_does_not_run_says_what_does() -> None:
+def test_finding_a_graph_that_does_not_run_raises() -> None:
     with pytest.raises(NotRunning, match="no graph 'nothing' runs on this machine"):
         find_running("nothing")
 

@@ -61,7 +61,7 @@ def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> N
     assert "is there already" in call("new", "operator", "x", "--kind", "program", "--to", tmp_path, code=2).stderr
 
 
-def test_what_is_written_is_in_the_projects_own_format(tmp_path: Path) -> None:
+def test_generated_files_pass_ruff(tmp_path: Path) -> None:
     ruff = Path(sys.executable).parent / "ruff"
     if not ruff.is_file():
         pytest.skip("ruff (the [dev] extra) is not installed")
@@ -168,7 +168,7 @@ def test_a_service_is_a_unit_that_systemd_takes(tmp_path: Path, monkeypatch: pyt
         assert (done.returncode, about) == (0, [])
 
 
-def test_the_page_shows_what_is_written() -> None:
+def test_page_shows_the_generated_files() -> None:
     page = (REPOSITORY / "docs" / "other-languages.md").read_text(encoding="utf-8")
     files = operator_files("Brightness", "program")
     shown = re.search(r"```cpp\n(.*?)```", page, re.DOTALL)

@@ -68,7 +68,7 @@ def test_demo_opens_window_or_writes_file_of_free_name(tmp_path: Path, monkeypat
     assert demo_command._outputs().view_file == Path("dataflow-demo-2.rrd")
 
 
-def test_the_demo_names_what_is_missing(tmp_path: Path, monkeypatch) -> None:
+def test_commands_without_shipped_files_suggest_reinstalling(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(shipped, "folder", lambda name: tmp_path / name)
     assert "install robot-dataflow again" in call("demo", code=2).stderr
     assert "install robot-dataflow again" in call("graphs", code=2).stderr

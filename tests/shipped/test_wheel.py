@@ -47,7 +47,7 @@ def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_the_sdist_holds_what_the_repository_holds(sdist: Path, repository: Path) -> None:
+def test_sdist_holds_the_files_of_the_repository(sdist: Path, repository: Path) -> None:
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     for folder in ("dataflow", "operators", "graphs", "recordings", "docs", "tests", "tools", "benchmarks"):

@@ -82,7 +82,7 @@ def test_tasks_wait_on_simulated_time_and_are_woken() -> None:
     assert seen == [("slept", 3600), ("woken", 3600)]
 
 
-def test_a_killed_process_does_nothing_more_and_a_frozen_one_goes_on_where_it_was() -> None:
+def test_killed_process_stops_and_a_frozen_one_resumes() -> None:
     world = World(1)
     seen: Counter[str] = Counter()
 
@@ -119,7 +119,7 @@ def test_ticks_of_the_longest_pause_are_fewer_than_the_calls_of_a_spin() -> None
     assert round(LONGEST_PAUSE / TICK) * 10 <= MOST_CALLS
 
 
-def test_what_is_deleted_makes_room_on_a_disk(tmp_path: Path) -> None:
+def test_deleting_a_file_frees_disk_space(tmp_path: Path) -> None:
     disk = Disk(World(1), tmp_path, room=100)
     descriptor = disk.open(tmp_path / "one", os.O_WRONLY | os.O_CREAT, 0o600)
     while disk.statvfs(tmp_path).f_bavail:
@@ -158,7 +158,7 @@ def _functions(module: ModuleType) -> Iterator[FunctionType]:
 # Runs
 
 
-def test_ticks_that_came_due_during_a_pause_are_given_the_time_of_those_of_a_freeze() -> None:
+def test_time_limit_allows_for_ticks_due_during_a_pause() -> None:
     ticks = replace(PLAIN, graph=TICKING, live=True, work=0.05)
     frozen, paused = (
         replace(ticks, happenings=(Happening(0.1, kind, "left", {"span": 6.0}),)) for kind in ("freeze", "pause")
@@ -179,7 +179,7 @@ def test_a_seed_gives_one_course(memory: Path) -> None:
     assert courses[0] == courses[1]
 
 
-def test_a_killed_process_of_a_live_run_comes_back_and_the_recording_is_whole(memory: Path) -> None:
+def test_killed_process_of_a_live_run_restarts_and_the_recording_is_whole(memory: Path) -> None:
     policy = "restart: {max: 5, backoff: 10ms}"
     kills = (Happening(0.03, "kill", "relay"), Happening(0.06, "kill", "left"))
     scenario = replace(PLAIN, live=True, policy=policy, count=12, period=20_000_000, happenings=kills)
@@ -261,7 +261,7 @@ def test_seeds(first: int, memory: Path) -> None:
             pytest.fail(f"{scenario.describe()}\n{violation}")
 
 
-def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_not_replayed(memory: Path) -> None:
+def test_recording_lacking_inputs_of_actuators_is_completed_not_replayed(memory: Path) -> None:
     parts = (
         "left: {SOURCE}",
         "arm: {use: simulation.operators:Arm, inputs: {x: left/fast}}",
@@ -283,9 +283,7 @@ def test_a_recording_without_what_only_the_outside_world_took_is_completed_and_n
         ("sum was at stamp 3 after 1 firings, sources had given up to 9", 0.97, False),
     ],
 )
-def test_only_a_recorder_that_writes_all_the_time_may_leave_a_stopped_run_undrained(
-    owed: str, busy: float, outrun: bool
-) -> None:
+def test_only_a_constantly_writing_recorder_excuses_incomplete_draining(owed: str, busy: float, outrun: bool) -> None:
     failure = RunFailed(f"interrupted, and not everything was drained within 20 s: {owed}", interrupted=True)
 
     assert is_outrun(Outcome(failure=failure, disk_busy=busy)) is outrun
@@ -378,14 +376,14 @@ def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -
 @pytest.mark.parametrize(
     ("name", "seed"), [("part", 36), ("state", 26), ("reload", 93), ("again", 4), ("drops", 173), ("half", 11)]
 )
-def test_a_fault_of_what_is_recorded_is_found(name: str, seed: int, memory: Path) -> None:
+def test_recording_mutants_are_detected(name: str, seed: int, memory: Path) -> None:
     check(scenario_of(seed), memory, replay=False)
 
     with MUTANTS[name].planted(), pytest.raises(Violation):
         check(scenario_of(seed), memory, replay=False)
 
 
-def test_a_pipe_that_does_not_notice_what_its_link_lost_is_found() -> None:
+def test_pipe_mutant_that_ignores_link_losses_is_detected() -> None:
     travel(journey_of(3))
 
     with MUTANTS["link"].planted(), pytest.raises(Violation, match=r"out of order|was changed|did not come"):
@@ -408,7 +406,7 @@ def test_a_graph_is_shrunk_only_to_graphs(memory: Path) -> None:
     assert small.count == 1
 
 
-def test_what_fails_otherwise_is_a_broken_promise_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_exception_is_a_violation_of_its_seed(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulation.check._verify", lambda *_: 1 // 0)
 
     with pytest.raises(Violation, match="ZeroDivisionError"):
@@ -429,7 +427,7 @@ RUN = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
 
 
 @pytest.mark.parametrize("lost", [{}, {"lost": {"messages": 1}}], ids=["not counted", "counted"])
-def test_files_in_which_nothing_is_are_those_of_a_recorder_that_counts_what_is_lost(
+def test_empty_recordings_are_accepted_only_with_counted_losses(
     lost: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As of one that was killed when it began, of which the next one found the disk full."""

@@ -71,7 +71,7 @@ def test_stopped_process_blocks_no_sender_and_reads_the_latest_message(
     assert answer(channel) == ("last", {"frontier": 4999})
 
 
-def test_what_cannot_be_replaced_is_bounded(stopped: tuple[QueuedChannel, subprocess.Popen[bytes]]) -> None:
+def test_queue_of_irreplaceable_messages_is_bounded(stopped: tuple[QueuedChannel, subprocess.Popen[bytes]]) -> None:
     channel, _ = stopped
 
     for _ in range(50):
@@ -82,7 +82,7 @@ def test_what_cannot_be_replaced_is_bounded(stopped: tuple[QueuedChannel, subpro
     assert channel.queued < 1.2 * (1 << 20)
 
 
-def test_news_follows_what_was_queued_after_older_news() -> None:
+def test_replacing_message_keeps_the_latest_value_only() -> None:
     channel = QueuedChannel()
     process = Channel(channel.theirs)
     channel.send("covered", {"frontier": 1}, replaces=True)

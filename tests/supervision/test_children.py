@@ -120,7 +120,7 @@ def test_messages_and_lines_become_events_of_their_process(scene: Scene) -> None
     )
 
 
-def test_what_a_process_said_and_printed_comes_before_its_end(scene: Scene) -> None:
+def test_messages_and_output_of_a_process_precede_its_death(scene: Scene) -> None:
     scene.said.send("closed", facts={})
     os.write(scene.printed, b"last words\nand no end")
     found = scene.hears(ChildExited(scene.a, -9))

@@ -126,7 +126,7 @@ def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
     assert outcome == "failed: operator 'sum' failed in close(): RuntimeError: no camera"
 
 
-def test_covered_goes_to_processes_with_sources_only_and_replaces_what_is_queued() -> None:
+def test_covered_goes_to_source_processes_only_and_replaces_the_queued_one() -> None:
     play = Play().starts()
 
     told = play.tell(play.progress("sum", {"sum": 5}), play.progress("sum", {"sum": 6}))
@@ -149,7 +149,7 @@ def test_the_first_death_ends_the_run_with_how_far_it_was_and_its_last_words() -
     assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: process 'sum' was killed")
 
 
-def test_what_fails_because_of_a_failure_is_noted_and_the_first_cause_stays() -> None:
+def test_consequent_failure_is_noted_and_the_first_cause_stays() -> None:
     play = Play().starts()
     play.deaf.add("left")
     play.tell(play.failed("sum", "fire at stamp 5"))
@@ -203,7 +203,7 @@ def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
     assert play.core.status.notes == ["the graph looks further ahead than the window: doubled to 16 messages"]
 
 
-def test_what_is_under_way_is_no_proof() -> None:
+def test_messages_in_flight_prevent_the_proof_of_completion() -> None:
     play = Play().starts()
 
     for k in range(100):
@@ -256,7 +256,7 @@ def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> 
     assert killed(play.commands) == []
 
 
-def test_a_process_that_is_still_starting_at_ctrl_c_is_killed_soon_and_that_is_no_failure() -> None:
+def test_process_still_starting_at_ctrl_c_is_killed_without_failure() -> None:
     play = Play(record="run.mcap")
     play.deaf.add("sum")
     play.tell(RunStarted(), Received("sum", "joined", {}))
@@ -291,7 +291,7 @@ def test_a_second_ctrl_c_while_starting_does_not_wait() -> None:
     assert play.failure() == "stopped before everything was closed"
 
 
-def test_endless_draining_is_bounded_and_reports_what_is_owed() -> None:
+def test_draining_is_bounded_and_reports_the_backlog() -> None:
     play = Play(stall_timeout=30.0).starts()
     play.tell(play.progress("left", {"left": 1_800_000_000}))
     play.stops()
@@ -321,7 +321,7 @@ def test_patience_shortens_the_time_for_closing(patience: float, closes_within: 
     assert asked_where(play.commands) == ["sum"]
 
 
-def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_long_ago_is_not() -> None:
+def test_failure_details_hold_output_of_the_late_process_and_no_old_output_of_others() -> None:
     play = Play(stall_timeout=8.0).starts()
     play.deaf.add("sum")
     for label in play.processes:
@@ -338,7 +338,7 @@ def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_l
     assert "[left] left 0" not in details
 
 
-def test_what_a_process_has_left_behind_is_named() -> None:
+def test_processes_left_behind_are_named() -> None:
     play = Play().starts()
     play.tell(OrphansKilled(("sum",), ("sleep (process 12)",)), OrphansKilled(("left", "sum"), ("cat (process 13)",)))
     assert play.ends().notes == (
@@ -363,7 +363,7 @@ def test_after_the_end_nothing_is_commanded() -> None:
     assert [c for c in play.commands if isinstance(c, RunEnded)] == [play.over]
 
 
-def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> None:
+def test_progress_between_polling_rounds_invalidates_the_proof() -> None:
     """Everybody is idle, and as much was received as sent, in every round."""
     play = Play().starts()
     play.state = {"sent": 5, "received": 5}
@@ -381,7 +381,7 @@ def test_what_moves_between_two_rounds_of_questions_takes_the_proof_back() -> No
 
 
 @pytest.mark.parametrize("lost_after", [None, 5.0])
-def test_what_was_sent_and_not_received_counts_as_lost_only_after_a_while_in_which_nothing_moves(
+def test_unreceived_messages_count_as_lost_only_after_an_idle_period(
     lost_after: float | None,
 ) -> None:
     proof = Proof(lost_after)
@@ -465,7 +465,7 @@ def test_event_time_goes_by_the_rate_from_the_first_stamp() -> None:
     assert event["stamp"] == pytest.approx(8_000_000_000, abs=1e3)
 
 
-def test_a_report_has_what_processes_handed_in() -> None:
+def test_report_collects_the_figures_of_processes() -> None:
     play = Play(record="run.mcap").starts()
     play.tell(play.progress("left", {"left": 70}, drops={"sum": [["x", "full", 2]]}))
     play.now += 2.5

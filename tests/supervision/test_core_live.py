@@ -44,7 +44,7 @@ def record(operator: str, index: int, stamp: int) -> FiringRecord:
     return FiringRecord(operator, 0, index, "fire", stamp, outputs=(Emission(index, stamp, bytes(16)),))
 
 
-def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
+def test_dead_process_is_restarted_and_the_others_are_informed() -> None:
     play = robot(record="run.mcap").starts()
     play.keeps(record("smooth", 0, 5), record("smooth", 1, 7))
 
@@ -75,7 +75,7 @@ def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
     play.ends()
 
 
-def test_a_recorder_that_has_ended_goes_on_when_a_process_comes_back() -> None:
+def test_ended_recorder_continues_when_a_process_restarts() -> None:
     play = robot(record="run.mcap").starts()
     unaware = play.ended("@recorder")
     play.dies("smooth", -9)
@@ -158,7 +158,7 @@ def test_a_set_up_that_fails_after_a_restart_is_tried_again_by_the_policy() -> N
     assert play.core.status.notes[-1] == "process 'smooth' is back"
 
 
-def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_for_good_is_not() -> None:
+def test_failed_process_is_restarted_and_a_failed_operator_ends_the_run() -> None:
     play = robot().starts()
     failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "where": "", "traceback": "…"}
     play.tell(Received("smooth", "failed", failed))
@@ -182,7 +182,7 @@ def test_a_failure_that_is_outlived_keeps_its_line_and_traceback() -> None:
     assert (event["data"]["where"], event["data"]["traceback"]) == ("crashy.py:12", "Traceback …")
 
 
-def test_a_process_whose_set_up_failed_keeps_its_line_and_traceback_when_it_is_started_again() -> None:
+def test_failed_setup_keeps_its_line_and_traceback_across_the_restart() -> None:
     play = robot(record="run.mcap").starts()
     play.broken.add("smooth")
     play.dies("smooth", -9)
@@ -207,7 +207,7 @@ def test_one_that_failed_and_does_not_leave_is_killed() -> None:
     assert play.core.status.notes[-1] == "process 'smooth' is back"
 
 
-def test_a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_its_policy() -> None:
+def test_unresponsive_process_is_killed_and_restarted_by_its_policy() -> None:
     play = robot().starts()
     play.wait(1.0)
     play.deaf.add("smooth")
@@ -220,7 +220,7 @@ def test_a_process_that_is_stopped_or_reads_nothing_is_killed_and_restarted_by_i
     assert "process 'smooth' has read nothing for 3.5 s" in play.core.status.notes[0]
 
 
-def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
+def test_overflowed_recorder_without_a_policy_ends_the_run() -> None:
     play = robot(record="run.mcap", storage=Storage(on_failure="end")).starts()
     play.deaf.add("@recorder")
     play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))
@@ -229,7 +229,7 @@ def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
     assert play.failure() == "process '@recorder' has read nothing for 9 s"
 
 
-def test_a_recorder_that_lost_what_it_needs_is_followed_by_another() -> None:
+def test_overflowed_recorder_is_replaced() -> None:
     play = robot(record="run.mcap").starts()
     assert killed(play.tell(NotReading("@recorder", 9.0, 500))) == []  # it may wait for its disk
     assert killed(play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))) == ["@recorder"]
@@ -278,13 +278,13 @@ def test_stopped_consumer_is_not_waited_for_and_starts_a_new_backlog() -> None:
     assert covered(play, 1100)[1] == 900  # what it owes counts from when it was back
 
 
-def test_one_that_drops_nothing_catches_up_first_since_nothing_else_bounds_what_it_holds() -> None:
+def test_lossless_process_catches_up_before_sources_continue() -> None:
     play = stopped_for_a_while(SUM)
 
     assert covered(play, 1100)[1] == 300
 
 
-def test_what_did_not_reach_a_consumer_is_counted_against_it() -> None:
+def test_gap_at_a_consumer_is_counted_as_its_drops() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     gap = {"stream": "test/left/fast", "first": 10, "following": 15}
     play.tell(play.progress("sum", {"sum": 9}), Received("sum", "gap", gap), play.progress("sum", {"sum": 20}))
@@ -308,7 +308,7 @@ def backlog_while_at_a_call(slow: str, *, seconds: float, done: int) -> tuple[Pl
     return play, play.tell(Received("left", "backlog", {"messages": 50, "bytes": 2_000_000}))
 
 
-def test_an_operator_that_hangs_while_sources_drop_is_killed_and_restarted_by_its_policy() -> None:
+def test_hanging_operator_with_backlog_is_killed_and_restarted() -> None:
     play, told = backlog_while_at_a_call(SLOW, seconds=90.0, done=5)
 
     assert killed(told) == ["slow"]
@@ -319,7 +319,7 @@ def test_an_operator_that_hangs_while_sources_drop_is_killed_and_restarted_by_it
     )
 
 
-def test_an_operator_without_a_policy_that_hangs_ends_the_run_with_what_would_help() -> None:
+def test_hanging_operator_without_a_policy_ends_the_run_with_a_remedy() -> None:
     play, _ = backlog_while_at_a_call(NO_POLICY, seconds=90.0, done=5)
 
     assert "wait: give it a `deadline` or a restart policy" in play.failure()
@@ -330,9 +330,7 @@ def test_an_operator_without_a_policy_that_hangs_ends_the_run_with_what_would_he
     [(SLOW, 1.0, 5), (SLOW, 90.0, 900), (BLOCKS, 90.0, 5)],
     ids=["short", "ahead", "blocks"],
 )
-def test_a_short_call_one_that_is_not_behind_and_one_that_sources_wait_for_are_no_hang(
-    slow: str, seconds: float, done: int
-) -> None:
+def test_short_calls_and_calls_without_backlog_or_drops_are_no_hang(slow: str, seconds: float, done: int) -> None:
     play, told = backlog_while_at_a_call(slow, seconds=seconds, done=done)
 
     assert killed(told) == []
@@ -351,7 +349,7 @@ def test_restarted_source_gets_the_covered_frontier_again() -> None:
     assert [fields for label, fields in sent(told, "covered") if label == "left"][-1:] == [before]
 
 
-def test_a_robot_at_which_nothing_happens_goes_on() -> None:
+def test_idle_robot_keeps_running() -> None:
     play = robot(stall_timeout=20.0).starts()
 
     play.wait(300.0)
@@ -396,7 +394,7 @@ def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
     assert asked_where(play.commands) == ["smooth"]
 
 
-def test_a_call_that_does_not_end_is_named_when_the_sources_have_ended_though_a_timer_goes_on() -> None:
+def test_endless_call_is_named_once_the_sources_have_ended() -> None:
     play = robot(stall_timeout=20.0).starts()
     play.beating = False
     for k in range(60):
@@ -437,7 +435,7 @@ def test_a_source_behind_the_clock_is_named_at_once_and_at_the_end() -> None:
     assert play.ends().notes[-1] == "source 'left' was 3.5 s behind the clock at the end, 3.5 s at most"
 
 
-def test_a_process_that_is_busy_is_named_as_what_holds_its_source_up() -> None:
+def test_busy_process_is_named_as_the_cause_of_a_late_source() -> None:
     play = Play(LEFT, SUM, live=True, placement="one_process").starts()
     (label,) = play.processes
     counts = {"left": [1, 1, 0, 0, 5], "sum": [1, 1, 0, 0, 5]}
@@ -456,7 +454,7 @@ def test_a_source_whose_stamps_jumped_far_ahead_is_named() -> None:
     ]
 
 
-def test_planned_faults_happen_at_their_time_and_what_is_frozen_thaws() -> None:
+def test_planned_faults_occur_on_time_and_frozen_processes_thaw() -> None:
     freeze, kill = Fault(0.5, "freeze", "smooth", {"span": 0.3}), Fault(2.0, "kill", "left", {})
     play = robot(faults=iter([freeze, kill, Fault(9.0, "raise", "smooth", {})])).starts()
 
@@ -475,7 +473,7 @@ def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
     assert play.failure() == "interrupted while process 'smooth' was to be started again"
 
 
-def test_what_did_not_drain_because_a_process_is_silent_is_laid_to_that() -> None:
+def test_incomplete_draining_is_attributed_to_the_silent_process() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     play.tell(play.progress("sum", {"sum": 9}))
     play.wait(1.0)
@@ -499,7 +497,7 @@ def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() 
     assert play.over is not None
 
 
-def test_lost_records_come_again_from_the_process_that_made_them_or_from_what_it_left() -> None:
+def test_lost_records_are_resent_by_their_process_or_from_its_black_box() -> None:
     play, lacks = robot(record="run.mcap").starts(), Received("@recorder", "lacks", {"operator": "smooth"})
     play.keeps(record("smooth", 0, 5))
     assert [(c.label, c.kind) for c in play.tell(lacks) if isinstance(c, Send)] == [("smooth", "lacks")]
@@ -537,7 +535,7 @@ def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
     assert play.over is None
 
 
-def test_a_run_that_is_stopped_while_a_machine_is_out_of_reach_waits_shortly_and_names_it() -> None:
+def test_run_stopped_with_an_unreachable_machine_waits_briefly_and_names_it() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     play.tell(LinkChanged("robot", ("sum",), up=False))
     play.deaf.add("sum")
@@ -596,7 +594,7 @@ def told(firings: int, dropped: int, timeouts: int) -> Received:
     return Received("smooth", "progress", {"done": {}, "counts": counts, "drops": drops, "waits": waits})
 
 
-def test_what_an_operator_did_before_its_restarts_counts_with_what_it_does_now() -> None:
+def test_counts_of_an_operator_span_its_restarts() -> None:
     play = robot().starts()
     play.tell(told(2, 1, 1), told(5, 4, 2))
     for _ in range(2):
@@ -610,7 +608,7 @@ def test_what_an_operator_did_before_its_restarts_counts_with_what_it_does_now()
     assert status.waits["smooth"] == {("x", "timeout"): 8}
 
 
-def test_operators_that_are_made_anew_within_their_process_are_counted() -> None:
+def test_operators_recreated_within_their_process_are_counted() -> None:
     play = robot().starts()
     failed = {"when": "fire at stamp 5", "summary": "x", "pause": 0.5, "where": "", "traceback": ""}
     for name in ("smooth", "after", "smooth"):
@@ -734,7 +732,7 @@ def test_restarted_process_gets_the_streams_that_ended_meanwhile() -> None:
     assert sent(given, "ended_elsewhere") == [("smooth", over)]
 
 
-def test_one_whose_messages_are_not_seen_to_arrive_goes_on_without_in_the_end() -> None:
+def test_process_continues_without_a_stream_that_never_arrives() -> None:
     play = robot(AFTER.replace("after", "other")).starts()
     play.dies("smooth", -9)
     play.deaf.add("after")  # it sees no probe, and lives
@@ -759,7 +757,7 @@ def test_one_that_is_not_ready_again_in_time_is_killed(monkeypatch: pytest.Monke
     assert any("was not ready again within 3 s" in note for note in play.core.status.notes)
 
 
-def test_a_process_that_comes_back_is_progress() -> None:
+def test_restarted_process_counts_as_progress() -> None:
     """Another one is at one call meanwhile, which alone would end the run after 20 s."""
     play = robot(stall_timeout=20.0).starts()
     play.beating = False
@@ -784,7 +782,7 @@ def test_only_the_last_records_of_the_dead_are_handed_over() -> None:
     assert fields["batches"][-1] == encode_batch([record("smooth", HANDED_OVER + 2, HANDED_OVER + 2)])
 
 
-def test_the_flight_recorder_is_triggered_once_by_what_every_process_hands_on() -> None:
+def test_trigger_forwarded_by_several_processes_fires_once() -> None:
     play = robot(record="run.mcap").starts()
     for label, number in (("left", "a"), ("smooth", "a"), ("smooth", "b"), ("after", "a")):
         play.tell(Received(label, "trigger", {"id": number, "text": f"bump {number}"}))

@@ -46,7 +46,7 @@ def runs(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def test_processes_of_an_early_nursery_find_modules_variables_and_libraries_that_came_after_it(
+def test_early_nursery_processes_see_later_modules_and_variables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_sum.py").write_text(OWN)
@@ -62,7 +62,7 @@ def test_processes_of_an_early_nursery_find_modules_variables_and_libraries_that
 
 
 @pytest.mark.long
-def test_a_graph_with_other_threads_gets_a_nursery_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_graph_with_another_thread_count_gets_a_separate_nursery(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[str] = []
     real = supervisor.Nursery
     monkeypatch.setattr(supervisor, "Nursery", lambda given: started.append(given["OMP_NUM_THREADS"]) or real(given))

@@ -53,7 +53,7 @@ def test_dropping_operator_reports_the_number() -> None:
     assert health.level == Level.WARN
 
 
-def test_a_timeout_is_no_drop_and_has_a_word_of_its_own() -> None:
+def test_timeout_is_reported_apart_from_drops() -> None:
     health = while_waiting({("image", "timeout"): 2}, {("image", "timeout"): 5})
 
     assert (health.state, health.dropped, health.drop_rate) == ("timeout", 0, 0.0)
@@ -61,7 +61,7 @@ def test_a_timeout_is_no_drop_and_has_a_word_of_its_own() -> None:
     assert health.level == Level.WARN
 
 
-def test_messages_that_came_late_have_a_word_of_their_own() -> None:
+def test_late_messages_are_reported_apart_from_drops() -> None:
     health = while_waiting({}, {("image", "late"): 4})
 
     assert (health.state, health.note) == ("late", "4 messages in 2.0 s came after their firing")
@@ -74,7 +74,7 @@ def test_waits_of_long_ago_say_nothing_of_now() -> None:
     assert while_waiting(old, old).state == "running"
 
 
-def test_a_drop_is_said_before_the_wait_that_came_with_it() -> None:
+def test_drops_take_precedence_over_timeouts() -> None:
     assert while_waiting({}, {("image", "late"): 4, ("image", "timeout"): 4}, dropped=1).state == "dropping"
 
 
@@ -109,7 +109,7 @@ def test_restarting_and_ended_take_precedence() -> None:
     assert (through.state, through.level) == ("ended", Level.OK)
 
 
-def test_counts_that_begin_anew_with_a_new_process_are_no_negative_rates() -> None:
+def test_counts_reset_by_a_new_process_give_no_negative_rates() -> None:
     health = after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1), (2.0, 13, 0, 0.2))
 
     assert health.rate == pytest.approx(10.0)

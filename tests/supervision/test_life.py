@@ -85,9 +85,7 @@ anything = st.one_of(
 
 
 @given(st.booleans(), st.sets(st.sampled_from(LABELS)), st.lists(anything, max_size=40))
-def test_whatever_happens_in_whatever_order_the_run_comes_to_an_end(
-    live: bool, deaf: set[str], course: list[Event | float]
-) -> None:
+def test_run_ends_after_any_sequence_of_events(live: bool, deaf: set[str], course: list[Event | float]) -> None:
     """Nothing raises, no wait is without bound, and after two Ctrl-C the end comes within seconds."""
     play = Play(LEFT, SMOOTH, SUM, live=live, record="run.mcap", stall_timeout=20.0)
     play.deaf |= deaf

@@ -51,7 +51,7 @@ def test_a_recorder_is_linked_to_every_process_also_for_its_firing_records() -> 
     }
 
 
-def test_a_process_sends_to_the_recorder_first_so_that_what_others_took_is_recorded_whenever_it_is_killed() -> None:
+def test_process_sends_to_the_recorder_before_other_consumers() -> None:
     made = plan(record=Path("run.mcap"))
     takers = [consumer for producer, consumer in pairs_of(made.graph, process_plans(made)) if producer == "left"]
     assert takers == ["@recorder", "smooth"]
@@ -88,7 +88,7 @@ def opened(made: RunPlan) -> Iterator[Mapping[str, Descriptors]]:
     links.close()
 
 
-def test_what_one_end_of_a_link_sends_arrives_at_the_other() -> None:
+def test_messages_sent_on_a_link_arrive() -> None:
     with opened(plan(record=Path("run.mcap"))) as handed:
         for keys, link in handed["smooth"].outgoing:
             link.send(0, [keys[0].encode()], len(keys[0]))
@@ -100,7 +100,7 @@ def test_what_one_end_of_a_link_sends_arrives_at_the_other() -> None:
 
 
 @pytest.mark.parametrize(("live", "kept"), [(False, 20_000), (True, 5_000)])
-def test_only_operators_of_a_live_run_may_miss_what_they_do_not_take(live: bool, kept: int) -> None:
+def test_only_links_to_operators_of_a_live_run_drop(live: bool, kept: int) -> None:
     with opened(plan(record=Path("run.mcap"), live=live)) as handed:
         for _, link in handed["smooth"].outgoing:
             for _ in range(20_000):

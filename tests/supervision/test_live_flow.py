@@ -44,13 +44,13 @@ def test_sources_wait_for_those_that_drop_nothing_and_depend_on_none_that_does()
     assert waited_for(graph(), [[name] for name in graph().nodes]) == {"exact", "merge", "mix", "last"}
 
 
-def test_an_operator_that_drops_frees_what_shares_its_process() -> None:
+def test_dropping_operator_exempts_its_process_from_flow_control() -> None:
     processes = [["left", "slow", "mix"], ["right", "merge", "exact"], ["after"], ["last"]]
 
     assert waited_for(graph(), processes) == {"exact", "merge"}
 
 
-def test_an_operator_is_behind_by_what_its_sources_have_given() -> None:
+def test_lag_of_an_operator_is_relative_to_its_sources() -> None:
     behind = flow()
     behind.reached("left", 100)
     behind.reached("right", 100)

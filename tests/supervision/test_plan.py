@@ -67,7 +67,7 @@ def test_each_stream_goes_to_the_processes_that_take_it() -> None:
     assert not any(p.has_log or p.firings or p.sink for p in found.values())
 
 
-def test_what_stays_within_a_process_is_not_sent() -> None:
+def test_streams_within_a_process_are_not_published() -> None:
     found = plans(placement={"left": "a", "smooth": "a", "sum": "b", "other": "b"})
     assert {label: (p.nodes, p.publish, p.subscribe) for label, p in found.items()} == {
         "a": (("left", "smooth"), {FAST: 1, MEAN: 1}, ()),
@@ -75,7 +75,7 @@ def test_what_stays_within_a_process_is_not_sent() -> None:
     }
 
 
-def test_a_recorder_takes_the_streams_of_the_graph_and_the_firing_records_of_all_operators() -> None:
+def test_recorder_subscribes_to_all_streams_and_firing_records() -> None:
     found = plans(record=Path("run.mcap"), compression="lz4", overwrite=True, metadata={"a": {"b": "c"}})
     recorder = found["@recorder"]
     assert (recorder.sink, recorder.nodes, recorder.publish) == ("record", (), {})
@@ -92,7 +92,7 @@ def test_a_recorder_takes_the_streams_of_the_graph_and_the_firing_records_of_all
     assert some["@recorder"].streams == (MEAN,)
 
 
-def test_a_flight_recorder_settles_before_it_keeps_and_a_run_without_sinks_has_no_records() -> None:
+def test_flight_recorder_settles_first_and_runs_without_sinks_have_no_records() -> None:
     options = dict(plans(flight=Path("kept"), live=True)["@recorder"].options)
     assert (options["flight"], options["overwrite"], options["settle"]) == ("kept", True, FLIGHT_SETTLES)
     assert options["label"].startswith("robot-")
@@ -100,7 +100,7 @@ def test_a_flight_recorder_settles_before_it_keeps_and_a_run_without_sinks_has_n
     assert not any("firings" in key for p in plans().values() for key in p.publish)
 
 
-def test_a_viewer_file_shows_all_but_what_the_graph_hides() -> None:
+def test_viewer_file_omits_the_streams_hidden_by_the_graph() -> None:
     found = plans("view: {hide: [smooth/mean, left/slow]}\n", view_file=Path("run.rrd"))
     assert (found["@view"].sink, found["@view"].streams) == ("view", (CONSTANT, FAST))
     assert found["@view"].options["path"] == "run.rrd"
@@ -110,7 +110,7 @@ def test_a_viewer_file_shows_all_but_what_the_graph_hides() -> None:
 LOG = LogPlan(Path("run.mcap"), (FAST, CONSTANT), {FAST: 99}, first=7)
 
 
-def test_a_recording_takes_the_place_of_what_made_its_streams() -> None:
+def test_recording_replaces_the_operators_of_its_streams() -> None:
     assert replaced_in(graph(), None) == set()
     assert replaced_in(graph(), LOG) == {"left"}
     found = plans(log=LOG, record=Path("again.mcap"))
@@ -123,7 +123,7 @@ def test_a_recording_takes_the_place_of_what_made_its_streams() -> None:
     assert (one["all"].nodes, one["all"].has_log) == (("smooth", "sum", "other"), True)
 
 
-def test_streams_of_an_operator_in_the_middle_leave_what_is_before_it_to_run_for_others() -> None:
+def test_log_of_an_inner_operator_keeps_its_upstream_for_others() -> None:
     middle = plans(log=LogPlan(Path("run.mcap"), (MEAN,)))
     assert middle["left"].publish == {FAST: 1}  # to `other` alone
     assert middle["@log"].publish == {MEAN: 1}
@@ -166,7 +166,7 @@ def test_processes_are_configured_by_the_plan() -> None:
 @pytest.mark.parametrize(
     ("live", "rate", "expected"), [(True, None, 1.0), (True, 2.0, 2.0), (False, None, None), (False, 0.5, 0.5)]
 )
-def test_a_live_run_goes_at_the_pace_of_the_clock_and_its_sources_wait_for_no_operator(
+def test_live_run_is_paced_by_the_clock_and_sources_drop_instead_of_waiting(
     live: bool, rate: float | None, expected: float | None
 ) -> None:
     left = configs(live=live, rate=rate, record=Path("run.mcap"))["left"]

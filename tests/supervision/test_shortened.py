@@ -58,7 +58,7 @@ def test_a_call_that_waits_in_the_engine_itself_is_left_whole() -> None:
     assert shortened([header, *ENGINE]) == [header, *ENGINE[:2]]
 
 
-def test_of_a_stack_whose_innermost_frames_were_not_kept_nothing_is_left_but_the_operators() -> None:
+def test_truncated_stack_keeps_only_the_frames_of_operators() -> None:
     mine = '  File "/mine/robot.py", line 7 in setup'
 
     assert shortened([mine, *ENGINE, "", "and on"]) == [mine, "", "and on"]

@@ -71,7 +71,7 @@ def test_a_process_that_got_the_number_of_an_ended_one_is_left_alone(
 
 
 @pytest.mark.long
-def test_only_parents_signal_by_number_and_only_children_that_they_have_not_waited_for() -> None:
+def test_processes_are_signalled_by_number_only_where_allowed() -> None:
     found: dict[str, int] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -119,7 +119,7 @@ def test_runs_in_processes_warn_before_they_start(
         ("perception_rgbd", True, ["perception/postures", "perception/people"]),
     ],
 )
-def test_networks_that_know_simulated_people_are_off_at_real_cameras_and_named_where_they_are_on(
+def test_networks_trained_on_simulated_people_are_off_at_real_cameras_or_warned_of(
     name: str, recognize: bool, named: list[str], repository: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = ["perception.recognize=true"] if recognize else []

@@ -59,7 +59,7 @@ def test_many_figures_are_judged_together() -> None:
     assert [one.figure for one in compared(figures) if one.differs] == ["x: recall"]
 
 
-def test_recordings_that_bring_the_difference_come_first_whether_b_is_better_or_worse() -> None:
+def test_recordings_are_sorted_by_their_share_of_the_difference() -> None:
     changes = {f"r{k}": change for k, change in enumerate((0.3, 0.2, 0.0, -0.1))}
     better = {name: (0.5, 0.5 + change) for name, change in changes.items()}
     worse = {name: (b, a) for name, (a, b) in better.items()}

@@ -140,6 +140,6 @@ def test_a_comma_inside_brackets_or_quotes_belongs_to_the_value() -> None:
         (["a=1,2,1"], "a value stands there twice"),
     ],
 )
-def test_what_is_no_choice_is_refused(words: list[str], what: str) -> None:
+def test_malformed_sweep_choice_is_refused(words: list[str], what: str) -> None:
     with pytest.raises(SweepError, match=what):
         grid(words)

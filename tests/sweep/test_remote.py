@@ -67,7 +67,7 @@ def test_missing_paths_of_a_web_server_are_reported(web: str, tmp_path: Path) ->
         found(tmp_path, f"{web}/empty")
 
 
-def test_a_recording_of_a_store_without_times_or_tags_is_never_taken_for_one_that_was_run(
+def test_recording_in_a_store_without_times_or_tags_is_never_reused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = fsspec.filesystem("memory")

@@ -65,7 +65,7 @@ def test_calls_are_forks_of_one_process(worker: Worker, output: tuple[Path, Path
     assert warm(worker) == first
 
 
-def test_what_starts_a_thread_when_it_is_imported_is_left_to_each_run(
+def test_module_starting_a_thread_at_import_is_not_preloaded(
     worker: Worker,
     output: tuple[Path, Path],
     tmp_path: Path,

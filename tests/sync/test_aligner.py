@@ -47,7 +47,7 @@ def test_a_single_trigger_fires_on_every_message_at_once() -> None:
     assert aligner.output_frontier() == 5
 
 
-def test_a_merge_presents_the_messages_of_one_stamp_together_in_declared_then_key_order() -> None:
+def test_merge_groups_messages_of_one_stamp_in_declared_then_key_order() -> None:
     aligner = Aligner(AlignSpec((TriggerSpec("many", ("z", "y"), many=True), A), mode="merge"))
     push(aligner, "z", 2, 3)
     push(aligner, "a", 2, 4)
@@ -66,7 +66,7 @@ def test_a_merge_presents_the_messages_of_one_stamp_together_in_declared_then_ke
     ("before", "enough", "taken"),
     [(None, 10, 10), (1, 9, 9), (4, 6, 6)],  # stamp <= t, stamp < t, stamp <= t - D
 )
-def test_a_sampled_input_is_cut_at_its_delay_and_known_as_soon_as_its_frontier_is_there(
+def test_sampled_input_is_decided_once_its_frontier_passes_the_delay(
     before: int | None, enough: int, taken: int
 ) -> None:
     aligner = Aligner(AlignSpec((A,), (SampledSpec("x", ("x",), before=before),)))
@@ -78,7 +78,7 @@ def test_a_sampled_input_is_cut_at_its_delay_and_known_as_soon_as_its_frontier_i
     assert seen(poll_all(aligner)) == [(10, {"a": 10, "x": taken})]
 
 
-def test_a_required_sample_that_is_missing_or_stale_drops_the_trigger_and_says_why() -> None:
+def test_missing_or_stale_required_sample_drops_the_trigger_with_reason() -> None:
     aligner = Aligner(AlignSpec((A,), (SampledSpec("x", ("x",), max_age=5),)))
     aligner.advance("x", 1)
     push(aligner, "a", 1, 7, 8)
@@ -99,7 +99,7 @@ def test_an_optional_sample_that_is_stale_is_absent_and_flagged() -> None:
     assert (shape(stale.inputs["x"]), stale.stale) == (None, {"x"})
 
 
-def test_a_batch_holds_what_came_since_the_last_firing() -> None:
+def test_batch_holds_the_messages_since_the_last_firing() -> None:
     aligner = Aligner(AlignSpec((A,), batches=(BatchSpec("imu", ("imu",)),)))
     push(aligner, "imu", 1, 2, 3, 4, 5, 6)
     push(aligner, "a", 2, 3, 5)
@@ -125,7 +125,7 @@ def test_bounds_of_a_batch_keep_the_newest_and_count_the_rest() -> None:
     assert aligner.drops == {("imu", "unused"): 2}
 
 
-def test_ticks_lie_on_the_grid_from_the_first_stamp_to_the_final_one_and_join_firings() -> None:
+def test_ticks_lie_on_the_grid_and_join_firings() -> None:
     aligner = Aligner(AlignSpec((A,), every=10))
     push(aligner, "a", 5, 20, 34)
     aligner.end("a", 41)
@@ -252,7 +252,7 @@ def test_a_declaration_that_means_nothing_is_refused(build: object, message: str
         build()
 
 
-def test_sampled_streams_keep_only_what_a_future_firing_can_need() -> None:
+def test_sampled_streams_buffer_only_messages_of_future_firings() -> None:
     spec = AlignSpec((A,), (SampledSpec("x", ("x",), before=20),), (BatchSpec("imu", ("imu",), max=5),))
     aligner = Aligner(spec)
     peak = dict.fromkeys(("x", "imu"), 0)
@@ -270,7 +270,7 @@ def test_sampled_streams_keep_only_what_a_future_firing_can_need() -> None:
     assert seen(poll_all(aligner)) == [(5000, {"a": 5000, "x": 4980, "imu": list(range(4996, 5001))})]
 
 
-def test_a_join_keeps_of_an_input_only_what_a_future_anchor_can_match() -> None:
+def test_join_buffers_only_messages_a_future_anchor_can_match() -> None:
     aligner = Aligner(AlignSpec((A, B), tolerance=3))
     for stamp in range(1, 2000):
         aligner.push("b", Entry(stamp, seq=stamp))

@@ -145,7 +145,7 @@ def decided_by_rule(tolerance: int, anchor: int, anchors: list[int], a_front: in
     st.lists(st.integers(0, 40), unique=True, max_size=8).map(sorted),
     st.randoms(use_true_random=False),
 )
-def test_an_anchor_is_decided_no_later_than_the_rule_says(
+def test_anchor_is_decided_no_later_than_by_the_rule(
     tolerance: int, anchors: list[int], others: list[int], rng: random.Random
 ) -> None:
     aligner = join(tolerance)

@@ -32,7 +32,7 @@ def stamps(firings: list[Firing]) -> list[int]:
     return [f.stamp for f in firings]
 
 
-def test_a_trigger_at_or_before_the_last_decided_stamp_is_late_and_one_above_is_not() -> None:
+def test_trigger_is_late_up_to_the_last_decided_stamp() -> None:
     aligner = Aligner(AlignSpec((A, B), mode="merge"))
     push(aligner, "b", 60)
     aligner.force("a", 100)
@@ -52,7 +52,7 @@ def test_a_join_that_was_forced_to_pass_over_an_anchor_has_decided_it() -> None:
     assert aligner.drops == {("a", "unmatched"): 1, ("b", "late"): 1}
 
 
-def test_what_has_been_promised_downstream_is_decided() -> None:
+def test_messages_up_to_the_promised_output_frontier_are_late() -> None:
     aligner = Aligner(AlignSpec((A,)))
     aligner.force("a", 100)
     assert aligner.output_frontier() == 100
@@ -115,7 +115,7 @@ def test_ticks_go_on_by_force_when_the_inputs_have_stopped() -> None:
     assert aligner.drops == {("a", "late"): 1}
 
 
-def test_what_a_restarted_stream_repeats_is_late_and_what_is_new_takes_part() -> None:
+def test_messages_repeated_by_a_restarted_stream_are_late_and_new_ones_fire() -> None:
     aligner = Aligner(AlignSpec((A,), (SampledSpec("x", ("a",)),)))
     push(aligner, "a", 5, 10)
     aligner.reset("a", 1)
@@ -202,7 +202,7 @@ def test_firings_of_a_live_run_can_be_had_again_from_their_refs(scenario: Scenar
 
 @settings(max_examples=100, deadline=None)
 @given(scenarios(), seeds)
-def test_forcing_what_is_waited_for_decides_the_stamp(scenario: Scenario, seed: int) -> None:
+def test_forcing_the_awaited_inputs_decides_the_stamp(scenario: Scenario, seed: int) -> None:
     rng = random.Random(seed)
     aligner = Aligner(scenario.spec)
     for step in interleave(scenario.says, rng):
@@ -227,7 +227,7 @@ def test_forcing_what_is_waited_for_decides_the_stamp(scenario: Scenario, seed: 
         assert after is None or after.stamp > waiting.stamp or (unforced and set(after.needs) <= static_missing)
 
 
-def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
+def test_recorded_aligner_buffers_only_messages_of_later_records() -> None:
     spec = AlignSpec((A,), (SampledSpec("x", ("x",), required=False, max_age=1),))
     says: dict[str, list[Step]] = {
         "a": [("push", "a", e) for e in entries("a", *range(0, 900, 10))],
@@ -246,7 +246,7 @@ def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
     assert recorded.buffered() == {"a": 0, "x": 0}
 
 
-def test_a_recorded_aligner_says_which_message_it_waits_for() -> None:
+def test_recorded_aligner_names_the_message_it_waits_for() -> None:
     spec = AlignSpec((A,))
     says: dict[str, list[Step]] = {"a": [("push", "a", e) for e in entries("a", 1, 2)]}
     records = [refs_of(f) for f in run(spec, interleave(says, random.Random(0)))]

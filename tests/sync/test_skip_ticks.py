@@ -29,7 +29,7 @@ def test_ticks_before_a_stamp_are_dropped_and_the_next_is_on_the_grid() -> None:
     assert [d.stamp for d in aligner.take_drops()] == [10, 20, 30, 40, 50, 60, 70]
 
 
-def test_a_message_between_them_still_fires_and_one_on_the_grid_fires_without_its_tick() -> None:
+def test_messages_between_skipped_ticks_fire_without_their_tick() -> None:
     aligner = told(1, 30, 45, 100)
 
     aligner.skip_ticks(75)
@@ -37,7 +37,7 @@ def test_a_message_between_them_still_fires_and_one_on_the_grid_fires_without_it
     assert [(f.stamp, f.tick) for f in poll_all(aligner)][:4] == [(1, False), (30, False), (45, False), (80, True)]
 
 
-def test_only_ticks_that_are_known_to_be_there_are_left_out() -> None:
+def test_only_ticks_known_to_be_due_are_skipped() -> None:
     aligner = told(1, 32)
 
     aligner.skip_ticks(1000)

@@ -41,7 +41,7 @@ def test_durations_are_parsed_exactly(text: str | int, nanoseconds: int) -> None
         ("10000000h", "from 0 to"),
     ],
 )
-def test_a_bad_duration_says_what_would_be_right(value: object, hint: str) -> None:
+def test_bad_duration_is_refused_with_a_hint(value: object, hint: str) -> None:
     with pytest.raises(ValueError, match=hint):
         parse_duration(value)
 

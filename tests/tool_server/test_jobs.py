@@ -28,7 +28,7 @@ def hasty() -> Iterator[Jobs]:
     jobs.close()
 
 
-def test_what_operators_print_is_beside_the_answer(patient: Jobs, loud: tuple[str, str]) -> None:
+def test_output_of_operators_accompanies_the_answer(patient: Jobs, loud: tuple[str, str]) -> None:
     recording, folder = loud
     text = patient.call("goto", {"recording": recording, "operator": "loud", "call": "0", "path": [folder]})
 

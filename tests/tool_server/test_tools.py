@@ -166,7 +166,7 @@ def test_the_state_before_and_after_a_call(bugs: dict[str, str]) -> None:
         ask("state", bugs["wrong"], operator="sine", call="5")
 
 
-def test_the_history_of_a_field_leaves_out_what_stays(bugs: dict[str, str]) -> None:
+def test_history_of_a_field_lists_changes_only(bugs: dict[str, str]) -> None:
     told = ask("history", bugs["wrong"], operator="sum", field="out.out.vectors[0, 0]", first=SKIPPED - 2, last=-1)
 
     assert told["calls"] == [SKIPPED - 2, 700]
@@ -214,7 +214,7 @@ def test_a_value_that_stays_not_a_number_does_not_change() -> None:
     assert not _alike(nan, 1.0)
 
 
-def test_the_history_of_what_stays_not_a_number_is_one_change(bugs: dict[str, str]) -> None:
+def test_history_of_a_constant_nan_is_one_change(bugs: dict[str, str]) -> None:
     told = ask(
         "history", bugs["wrong"], operator="sine", field="float('nan') if number < 5 else inp.x.stamp * 0", last=9
     )
@@ -236,7 +236,7 @@ def test_that_nothing_differs_or_was_lost_is_an_answer(bugs: dict[str, str], tmp
     assert told["told"].startswith("nothing was lost")
 
 
-def test_what_if_the_code_or_a_parameter_were_another(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_if_reruns_with_changed_code_or_parameter(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZOO_FIXED", "1")
     told = ask("what_if", bugs["wrong"], operator="sum", call=str(SKIPPED), show="after['total']")
 
@@ -254,9 +254,7 @@ OTHERS = (
 
 
 @pytest.mark.long
-def test_a_fix_is_proven_when_it_changes_what_it_should_and_nothing_else(
-    bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fix_is_proven_if_only_the_expected_calls_change(bugs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     right = "out.out.vectors[0, 0] == before['total'] + 613"
     common = {"operator": "sum", "call": str(SKIPPED)}
     told = ask("prove", bugs["wrong"], expect=right, **common)
@@ -339,7 +337,7 @@ def test_each_tool_reports_calls_that_could_not_be_made(torn: str) -> None:
     assert told["not_made"] == {"sum": "51 of 701 calls could not be made again (bugs/src/x #650 is not recorded)"}
 
 
-def test_what_follows_a_cut_is_not_called_identical() -> None:
+def test_verdict_of_a_cut_recording_is_identical_up_to_the_cut() -> None:
     whole = Verification("whole", firings=3, verified=3)
     torn = Verification("torn", firings=5, verified=3, unverifiable=2, beyond=2, cut=True, missing="x #3")
     report = VerifyReport((whole, torn), (), (), 0, 0, 0.0, 0.0)
@@ -402,7 +400,7 @@ class Onwards(Chance):
 
 
 @pytest.mark.parametrize("shares", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_an_operator_that_did_not_repeat_before_the_fix_is_named_and_only_judged_where_it_may_be_changed(
+def test_unrepeatable_operator_is_named_and_judged_only_if_its_code_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shares: bool
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -16,7 +16,7 @@ from dataflow.transport import Bus, RunningGraph, TapServer, encode
 INFO = "robot1/camera/info"
 
 
-def test_a_tap_begins_with_the_statics_that_exist_and_waits_for_no_process_that_has_none(
+def test_tap_starts_with_existing_statics_without_waiting_for_others(
     open_bus: Callable[..., Bus], endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The time allowed is longer than the test's: a wait for something that never comes would not end."""

@@ -27,7 +27,7 @@ def test_an_act_that_does_not_end_is_not_waited_for() -> None:
         gate.set()
 
 
-def test_what_an_act_raises_is_raised() -> None:
+def test_exception_of_a_bounded_act_is_raised() -> None:
     def fail() -> None:
         raise ConnectionError("nobody is there")
 

@@ -27,7 +27,7 @@ from dataflow.transport.network import is_local
 DEPTH = "robot1/camera/depth"
 
 
-def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
+def test_plain_subscriber_receives_all_messages_in_order(
     pair: tuple[Bus, Bus], eventually: Callable[..., None]
 ) -> None:
     first, second = pair
@@ -43,7 +43,7 @@ def test_a_plain_subscriber_gets_what_is_published_in_order_and_complete(
     assert first.counters()["published_messages"] == len(sent)
 
 
-def test_publisher_knows_whether_it_has_subscribers(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
+def test_publisher_reports_whether_it_has_subscribers(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
     first, second = pair
     publisher = first.publisher(DEPTH)
     assert not publisher.matched
@@ -97,7 +97,7 @@ def test_a_late_joiner_gets_the_static_streams_it_asks_for(
     assert bus.query_static("robot2") == {}
 
 
-def test_a_process_that_comes_back_on_its_endpoint_is_connected_again(
+def test_restarted_process_on_its_endpoint_is_reconnected(
     peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
 ) -> None:
     bus = open_bus(connect=(endpoint,))

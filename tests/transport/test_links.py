@@ -75,7 +75,7 @@ def test_the_oldest_messages_are_dropped_when_too_many_wait_and_ends_are_kept() 
     pair.close()
 
 
-def test_what_was_meant_for_a_consumer_that_died_does_not_reach_its_successor(pair: Pair) -> None:
+def test_messages_for_a_dead_consumer_do_not_reach_its_successor(pair: Pair) -> None:
     for k in range(20):
         pair.send(bytes([k]) * 900)
     pair.producer.take_leave(1)

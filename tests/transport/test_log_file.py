@@ -22,7 +22,7 @@ def texts(follower: LogFollower) -> list[str]:
     return [line["text"] for line in follower.lines()]
 
 
-def test_a_follower_reads_what_is_there_and_then_what_comes() -> None:
+def test_follower_reads_existing_lines_then_new_ones() -> None:
     log, follower = LogFile(), LogFollower(os.getpid())
     assert texts(follower) == []
     log.add(LogLine("info", "one"))

@@ -39,7 +39,7 @@ def test_everything_is_published_in_order_before_it_is_closed() -> None:
     assert subscriber.took == list(range(1000))
 
 
-def test_what_waits_for_a_slow_subscriber_is_bounded_and_the_oldest_goes_first() -> None:
+def test_queue_of_a_slow_subscriber_is_bounded_and_drops_the_oldest() -> None:
     counted = Counters()
     subscriber, outside = Subscriber(), OutsidePublisher(counted, lossless=False)
     publishes(outside, subscriber, range(1))

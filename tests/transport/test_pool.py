@@ -28,7 +28,7 @@ def write(pool: SharedPool, size: int, holder: Holder) -> Block | None:
     return pool.write([b"x" * size], size, (holder,))
 
 
-def test_what_one_size_has_released_serves_another_while_something_is_held() -> None:
+def test_released_blocks_are_reused_for_another_size() -> None:
     pool, holder = SharedPool(1024 * KIB), Holder()
     small = [write(pool, 64 * KIB, holder) for _ in range(16)]
     assert write(pool, 512 * KIB, holder) is None

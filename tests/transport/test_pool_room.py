@@ -65,7 +65,7 @@ def test_a_message_is_sent_from_where_its_array_was_made(pool: SharedPool) -> No
     assert sent.decoded(pool) == message
 
 
-def test_a_message_that_is_sent_on_another_stream_is_copied_and_the_first_envelope_stays(pool: SharedPool) -> None:
+def test_message_sent_on_another_stream_is_copied(pool: SharedPool) -> None:
     message, holder = depth(7), Holder()
     first, second = send(pool, message, holder, "a/b"), send(pool, message, holder, "a/another")
     assert first is not None
@@ -137,7 +137,7 @@ def test_arrays_outlive_the_pool_and_new_ones_are_made_elsewhere() -> None:
         make_large_arrays_in(None)
 
 
-def test_a_child_makes_arrays_in_memory_of_its_own(pool: SharedPool) -> None:
+def test_forked_child_allocates_arrays_outside_the_pool(pool: SharedPool) -> None:
     """It would write where its parent does."""
     child = os.fork()
     if child == 0:

@@ -30,7 +30,7 @@ def test_a_graph_is_found_while_it_runs() -> None:
     assert running() == []
 
 
-def test_what_a_killed_process_left_is_removed(peer: Callable[..., Any], folder: Path) -> None:
+def test_registry_entry_of_a_killed_process_is_removed(peer: Callable[..., Any], folder: Path) -> None:
     child = peer("registered", "-")
     child.expect("up")
     assert [g.pid for g in running()] == [child.pid]

@@ -99,7 +99,7 @@ def test_an_empty_ring_takes_every_frame_that_can_fit(sizes: list[int]) -> None:
     ends.close()
 
 
-def test_a_writer_goes_on_where_its_predecessor_was_killed(ends: Ends) -> None:
+def test_writer_continues_after_a_killed_predecessor(ends: Ends) -> None:
     ends.writer.put(0, [b"before"])
     successor = RingWriter(ends.descriptor, ends.to_reader)
     successor.put(0, [b"after"])
@@ -107,7 +107,7 @@ def test_a_writer_goes_on_where_its_predecessor_was_killed(ends: Ends) -> None:
     successor.close()
 
 
-def test_a_reader_skips_what_was_meant_for_its_predecessor(ends: Ends) -> None:
+def test_reader_skips_messages_for_its_predecessor(ends: Ends) -> None:
     ends.writer.put(0, [b"before"])
     successor = RingReader(ends.descriptor, ends.to_writer, 2)
     ends.writer.put(0, [b"after"])

@@ -107,7 +107,7 @@ def test_without_room_messages_travel_whole_and_are_counted(shared: Shared) -> N
     assert shared.fanout.counters()["shared_messages"] == 5
 
 
-def test_unheld_pool_is_cut_anew_for_another_size(shared: Shared) -> None:
+def test_unheld_pool_is_resized_for_other_messages(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     held.clear()
     assert shared.passed(9, 512) == depth_image(9, 512)  # 1 MB: fits only where all four were
@@ -146,7 +146,7 @@ def test_where_nothing_may_be_lost_all_of_the_pool_may_be_held() -> None:
     shared.close()
 
 
-def test_what_a_consumer_held_that_was_replaced_is_free(shared: Shared) -> None:
+def test_memory_held_by_a_replaced_consumer_is_freed(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     shared.outgoing[0].take_leave(1)
     shared.consumers[0] = shared.consumer(life=2)

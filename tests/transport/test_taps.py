@@ -86,7 +86,7 @@ def test_beyond_the_window_the_newest_message_of_each_stream_waits(
         assert client.refused == 0
 
 
-def test_a_window_in_bytes_bounds_what_is_under_way_but_lets_one_message_pass(
+def test_byte_window_bounds_messages_in_flight_but_admits_one(
     pair: tuple[Bus, Bus], server: TapServer, eventually: Callable[..., None]
 ) -> None:
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(bytes=1000)) as client:
@@ -150,7 +150,7 @@ def test_a_killed_viewer_is_forgotten(
         eventually(lambda: not server.active, timeout=5.0)
 
 
-def test_what_zenoh_drops_does_not_use_up_the_window(
+def test_messages_dropped_by_zenoh_leave_the_window_free(
     pair: tuple[Bus, Bus], server: TapServer, eventually: Callable[..., None]
 ) -> None:
     with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=2)) as client:
@@ -185,7 +185,7 @@ def test_the_newest_of_a_stream_is_sent_again_when_zenoh_dropped_it(
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_is_dropped_streams_stay_in_order_and_end_with_their_last_message(
+def test_streams_with_drops_stay_ordered_and_keep_their_last_message(
     pair: tuple[Bus, Bus],
     server: TapServer,
     eventually: Callable[..., None],

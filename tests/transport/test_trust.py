@@ -23,7 +23,7 @@ def sockets(endpoint: str) -> Path:
     return Path(endpoint.removeprefix("unixsock-stream/"))
 
 
-def test_sockets_lie_in_a_folder_of_their_owner_and_go_with_it(open_bus: Callable[..., Bus]) -> None:
+def test_sockets_lie_in_a_private_folder_removed_at_the_end(open_bus: Callable[..., Bus]) -> None:
     with Reservation(3) as reserved:
         assert len(set(reserved.endpoints)) == 3
         open_bus(listen=reserved.endpoints).close()

@@ -35,7 +35,7 @@ def hex_dump(data: bytes) -> str:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_examples_are_what_the_encoder_writes(repository: Path, name: str) -> None:
+def test_wire_format_examples_match_the_encoder(repository: Path, name: str) -> None:
     wire = encode(EXAMPLES[name])
     assert documented(repository, name) == wire, f"docs/wire-format.md should say\n{hex_dump(wire)}"
     assert decode(documented(repository, name)) == EXAMPLES[name]

@@ -51,7 +51,7 @@ def test_operators_that_feed_only_one_another_are_one_unit() -> None:
     }
 
 
-def test_what_is_cheap_to_repeat_is_repeated_by_several_and_what_is_dear_once() -> None:
+def test_cheap_operators_are_repeated_by_several_parts_and_costly_ones_once() -> None:
     decoding = [frozenset({"decoder", "odometry"}), frozenset({"decoder", "detector"})]
 
     assert balanced(decoding, {"decoder": 1, "odometry": 10, "detector": 9}, 2) == decoding
@@ -66,7 +66,7 @@ def test_where_other_work_levels_the_parts_a_unit_goes_where_it_adds_least() -> 
     assert balanced(decoding, work, 2, level=20) == [decoding[0] | decoding[1], decoding[2]]
 
 
-def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_else_by_the_first() -> None:
+def test_stream_is_checked_by_its_reader_else_its_producer_else_the_first_part() -> None:
     graph = load_graph(MIXED)
     checks = ["test/left/slow", "test/merge/seen", "test/mix/mixed", "test/smooth/mean"]
 

@@ -62,7 +62,7 @@ def test_a_static_stream_is_stored_once_however_often_it_was_made() -> None:
     assert check({(0, 0): b"a"}, static=True).result().missing == 1
 
 
-def test_what_lies_before_the_start_is_not_held() -> None:
+def test_messages_before_the_start_are_not_held() -> None:
     late = check({(0, seq): b"a" for seq in range(1000)}, whole=False)
     late.take((0, 990), b"a")
 

@@ -41,7 +41,7 @@ def test_workers_get_their_requests_under_the_threads_of_the_graph_and_answer_in
     assert answers == [{"word": w, "OMP_NUM_THREADS": "3", "PYTHONHASHSEED": "0"} for w in ("one", "two")]
 
 
-def test_what_a_worker_raises_ends_the_others_too() -> None:
+def test_exception_of_a_worker_ends_the_others() -> None:
     with pytest.raises(RunFailed, match="the wheels came off") as raised:
         call_workers([call("stall"), call("fail")], threads=1)
 
@@ -78,7 +78,7 @@ def test_a_worker_without_progress_is_ended_and_its_last_words_are_shown() -> No
 
 
 @pytest.mark.long
-def test_what_an_operator_has_started_ends_with_its_worker(tmp_path: Path) -> None:
+def test_child_processes_of_an_operator_end_with_its_worker(tmp_path: Path) -> None:
     note = tmp_path / "pid"
 
     with pytest.raises(RunFailed, match="was killed by SIGKILL"):

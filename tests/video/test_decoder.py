@@ -154,7 +154,7 @@ def test_a_loss_is_named_by_its_pictures(format_: str) -> None:
 
 @FORMATS
 @pytest.mark.parametrize("at", [0, 3, 8, 13])
-def test_another_decoder_goes_on_from_the_state_of_one(made: Made, format_: str, at: int) -> None:
+def test_decoder_continues_from_the_state_of_another(made: Made, format_: str, at: int) -> None:
     packets = clip(format_)
     one, other = made(format_), made(format_)
     for packet in packets[: at + 1]:
@@ -192,7 +192,7 @@ def test_a_key_frame_without_parameter_sets_takes_those_that_came_before(made: M
 
 
 @FORMATS
-def test_a_stream_goes_on_with_pictures_of_another_size(made: Made, format_: str) -> None:
+def test_stream_continues_with_frames_of_another_size(made: Made, format_: str) -> None:
     small, large = clip(format_), clip(format_, width=128)
     decoder = made(format_)
     for packet, frame in zip(

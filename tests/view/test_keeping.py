@@ -34,13 +34,13 @@ def test_a_cell_counts_once_and_only_when_it_was_seen_often_enough() -> None:
     assert seen == [[], [], [[1.01, 0.0, 0.0]], [], [], []]
 
 
-def test_what_moves_leaves_no_points() -> None:
+def test_moving_objects_leave_no_kept_points() -> None:
     kept = KeptPoints(step=0.05, after=3)
     moving = [drawn(kept, t, [[0.1 * t, 0.0, 0.0], [0.0, 5.0, 0.0]]) for t in range(20)]
     assert [point for found in moving for point in found] == [[0.0, 5.0, 0.0]]
 
 
-def test_a_cloud_waits_for_the_pose_of_its_own_stamp() -> None:
+def test_cloud_waits_for_the_pose_at_its_stamp() -> None:
     poses: dict[int, Points] = {}
     kept = KeptPoints(step=0.1, after=1)
     point, paint = np.array([[1.0, 0.0, 0.0]]), np.array([[9, 8, 7]], np.uint8)
@@ -68,7 +68,7 @@ def test_points_too_far_off_for_a_cell_are_left_out() -> None:
     assert drawn(kept, 0, [[1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]) == [[0.0, 0.0, 0.0]]
 
 
-def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tmp_path: Path) -> None:
+def test_kept_cloud_is_drawn_in_the_root_frame_by_the_pose_at_its_stamp(tmp_path: Path) -> None:
     types: dict[str, type[Message]] = {"r/cloud": PointCloud, "r/odometry": Odometry}
     state = SceneState(replace(layout(types), kept=frozenset({"r/cloud"})), ViewOptions(kept_after=2))
     told: list[tuple[str, Message]] = []

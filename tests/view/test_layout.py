@@ -30,7 +30,7 @@ def test_one_calibration_serves_all_images_of_its_device_and_they_share_a_plane(
     assert len({shown.planes[name] for name in streams}) == 1
 
 
-def test_images_without_calibration_have_planes_of_their_own() -> None:
+def test_images_without_calibration_have_separate_planes() -> None:
     shown = layout({"a/image": Image, "b/image": Image})
     assert {camera.info for camera in shown.cameras} == {None}
     assert shown.planes["a/image"] != shown.planes["b/image"]

@@ -106,7 +106,7 @@ def test_an_image_and_what_only_decodes_it_are_shown_once_with_overlays_on_the_o
     assert "r/color/image" in layout(without, linked(types, nodes, View())).streams  # nothing else shows it
 
 
-def test_truth_stands_aside_for_what_is_estimated() -> None:
+def test_ground_truth_is_shown_aside_of_estimates() -> None:
     types: dict[str, type[Message]] = {
         "r/robot/scene": SceneGraph,
         "r/robot/boxes": Boxes3D,

@@ -96,7 +96,7 @@ def test_an_intention_is_an_arrow_with_its_probability(tmp_path: Path) -> None:
     assert np.allclose(vector.values, [(-1, -2, -0.4)])
 
 
-def test_what_has_not_changed_is_not_sent_again(tmp_path: Path) -> None:
+def test_unchanged_scene_entities_are_not_resent(tmp_path: Path) -> None:
     found = draw(tmp_path, *(("s/graph", scene(t, person_x=3.0 + 0.1 * t)) for t in range(5)))
     assert len(at(found, "/s/graph/space/agents", "Capsules3D:translations")) == 5
     for entity, component in (

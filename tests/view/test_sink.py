@@ -339,7 +339,7 @@ def test_a_stream_that_is_not_shown_places_its_frame_all_the_same(by_graph: bool
     assert not [row for row in found if row.entity.startswith(("/odometry", "/frames/space"))]
 
 
-def test_a_stream_that_is_not_shown_wins_no_frame_from_one_that_is_and_brings_none_of_its_own(tmp_path: Path) -> None:
+def test_hidden_stream_neither_places_nor_adds_frames(tmp_path: Path) -> None:
     def placed_by(frame: str, k: int, x: float) -> Pose:
         return Pose(stamp=STAMP + k, frame=frame, child_frame="lidar", position=[x, 0, 0], orientation=[0, 0, 0, 1])
 
@@ -373,7 +373,7 @@ def test_scores_of_operators_without_outputs_have_a_panel(tmp_path: Path) -> Non
     assert "Scores" in [row.values[0] for row in blueprint_rows(path) if row.component.endswith("display_name")]
 
 
-def test_what_an_operator_found_wrong_stands_before_the_scores() -> None:
+def test_findings_precede_the_scores() -> None:
     maker, judge = (
         Node(name, "nowhere:Nothing", {}, {}, outputs, Live("newest", 1, {}))
         for name, outputs in (("calibration", {"status": "r/calibration/status"}), ("score", {}))
@@ -395,7 +395,7 @@ def test_targets_are_named_in_words() -> None:
         parse_target("browser")
 
 
-def test_what_cannot_be_reached_is_said_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreachable_viewer_is_refused_on_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ViewerError, match="there is no folder"):
         ViewerSink(Save(tmp_path / "none" / "a.rrd")).open({"imu": Imu})
     with pytest.raises(ViewerError, match=r"no viewer listens on 127\.0\.0\.1:1\b"):

@@ -78,7 +78,7 @@ def test_the_whole_way_of_a_run_without_ranges_is_in_view_when_it_is_over() -> N
 
 
 @pytest.mark.parametrize("far", [1.0, 4.0])
-def test_what_a_camera_sees_at_the_end_is_in_view_with_its_way(far: float) -> None:
+def test_viewpoint_covers_the_trajectory_and_the_last_camera_view(far: float) -> None:
     scene, shift = SceneState(), np.eye(4)
     ahead = np.stack(np.meshgrid([2.0 * far, 3.0 * far], np.linspace(-far, far, 9), np.linspace(-0.3, far, 9)), -1)
     for x in np.linspace(0, 3, 40):

@@ -58,7 +58,7 @@ TYPES = [
 STAMP = 1_700_000_000_123_456_789
 
 
-def test_every_message_type_has_a_visualizer_of_its_own() -> None:
+def test_every_message_type_has_a_visualizer() -> None:
     assert len(TYPES) > 30
     assert [t.__name__ for t in TYPES if not roles_of(t)] == []
 
@@ -84,7 +84,7 @@ def test_an_image_is_sent_as_jpeg_or_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", [0, 4 * PERIOD])
-def test_video_is_decoded_and_what_is_lost_is_not_shown(step: int, tmp_path: Path) -> None:
+def test_video_is_decoded_without_the_frames_lost(step: int, tmp_path: Path) -> None:
     packets = [
         CompressedVideo(stamp=k * PERIOD, frame="camera", format="h264", data=np.frombuffer(packet, np.uint8))
         for k, packet in enumerate(clip("h264"))
@@ -133,7 +133,7 @@ def test_inverse_depth_is_decoded(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.frombuffer(bytes(buffer.values[0]), np.float32), [0.0, 1.0, 0.5])
 
 
-def test_a_depth_png_finer_than_asked_for_is_written_anew(tmp_path: Path) -> None:
+def test_depth_png_finer_than_depth_step_is_reencoded(tmp_path: Path) -> None:
     import cv2
 
     noise = np.random.default_rng(0).integers(0, 20, (48, 64)).astype(np.uint16)
@@ -244,7 +244,7 @@ def odometry(t: int, x: float, **fields: object) -> Odometry:
     )
 
 
-def test_what_is_drawn_first_later_has_its_frame_from_the_beginning(tmp_path: Path) -> None:
+def test_entity_first_drawn_later_has_its_frame_from_the_beginning(tmp_path: Path) -> None:
     """The viewer reports an error of an entity whose frame it does not know, also while nothing of it is drawn."""
     told = [("first", cloud_in("odom", 5)), ("later", cloud_in("odom", 30)), ("later", cloud_in("odom", 40))]
     found = draw(tmp_path, *told)

@@ -55,13 +55,6 @@ def completion(
     out.print(Text(f"{shell} completes dataflow from its next start on ({path})"), soft_wrap=True)
 
 
-def shipped_graphs(incomplete: str) -> Iterator[str]:
-    """The graphs that come with dataflow; where none fits, the shell completes files."""
-    from dataflow.shipped import graphs
-
-    yield from (graph.name for graph in graphs() if incomplete and graph.name.startswith(incomplete))
-
-
 def running_graphs(incomplete: str) -> Iterator[str]:
     """The names of the graphs that run."""
     from dataflow.transport.registry import RegistryError, running

@@ -47,7 +47,7 @@ PLAYING = KeyBindings(
     "space: pause and go on · → or n: one step · + and -: twice and half as fast",
     frozenset({"toggle", "step", "faster", "slower"}),
 )
-KEEPING = KeyBindings("k: keep what was", frozenset({"keep"}))
+KEEPING = KeyBindings("k: save the history", frozenset({"keep"}))
 ENDING = KeyBindings("q: end", frozenset({"quit"}))
 ACTIONS = ("pause", "resume", "step", "speed", "status")
 

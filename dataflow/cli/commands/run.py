@@ -85,8 +85,8 @@ def run(graph: GraphFile, options: RunOptions) -> None:
     In a terminal, space pauses a run that is not live and lets it go on, the right arrow or n makes one step, + and -
     double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere, with the same results.
 
-    A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: what was is kept on a
-    trigger, with `dataflow trigger`, or by the key k.
+    A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: its history is
+    saved on a trigger, with `dataflow trigger`, or by the key k.
 
     Examples:
 

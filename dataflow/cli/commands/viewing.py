@@ -34,6 +34,7 @@ from dataflow.cli.support.drawing import (
 )
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, say
+from dataflow.cli.support.viewers import require_display
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -112,16 +113,6 @@ def _target(to: str, overwrite: bool) -> Target:
     if isinstance(target, Spawn):
         require_display()
     return target
-
-
-def require_display() -> None:
-    """An error, with what to use instead, where no window can be opened."""
-    from dataflow.view.process import display_problem
-
-    if (problem := display_problem()) is not None:
-        raise fail(
-            f"cannot open a viewer window: {problem}; use serve (a page for a browser) or a file name ending in .rrd"
-        )
 
 
 def _view_running(

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from dataflow.cli.commands.completion import shipped_graphs
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, seconds
 
 if TYPE_CHECKING:
     from dataflow.execution.feeds.playable import PlayableStreams
+
+
+def shipped_graphs(incomplete: str) -> Iterator[str]:
+    """The graphs that come with dataflow; where none fits, the shell completes files."""
+    from dataflow.shipped import graphs
+
+    yield from (graph.name for graph in graphs() if incomplete and graph.name.startswith(incomplete))
+
 
 Json = Annotated[bool, option("--json", "Print JSON instead of tables.")]
 Network = Annotated[

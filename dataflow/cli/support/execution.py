@@ -50,7 +50,7 @@ def checked_outputs(recorded: RecordOptions, viewed: ViewOptions, *, overwrite: 
     if viewed.open_saved and not saves:
         raise fail("--open opens a saved file: it needs --view FILE.rrd")
     if view == "spawn":
-        from dataflow.cli.commands.viewing import require_display
+        from dataflow.cli.support.viewers import require_display
 
         require_display()
     if record is not None:
@@ -131,13 +131,21 @@ def execute(
 
 
 def _named_by(failure: RunFailed, graph: Graph) -> str | None:
-    """The parameter, such as `camera.path`, whose value stands in a failure; the one with the longest value."""
+    """The parameter, such as `camera.path`, whose value stands in a failure; the one with the longest value.
+
+    Where a parameter of the graph fills it, that one.
+    """
     node = graph.nodes.get(failure.operator or "")
     texts = {name: value for name, value in (node.params if node else {}).items() if isinstance(value, str) and value}
     # `imu` names neither the file imu.csv nor my_imu; what a full stop follows is named
-    found = r"(?<![\w.-])%s(?!\.?[\w-])"
-    named = [name for name, value in texts.items() if re.search(found % re.escape(str(Path(value))), str(failure))]
-    return f"{failure.operator}.{max(named, key=lambda name: len(texts[name]))}" if named else None
+    whole = r"(?<![\w.-])%s(?!\.?[\w-])"
+    named = [name for name, value in texts.items() if re.search(whole % re.escape(str(Path(value))), str(failure))]
+    if node is None or not named:
+        return None
+    from dataflow.graph.load import filled_by
+
+    found = max(named, key=lambda name: len(texts[name]))
+    return filled_by(graph, node.name, found) or f"{node.name}.{found}"
 
 
 def _files_of(outputs: Outputs) -> list[Path]:

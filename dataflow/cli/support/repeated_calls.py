@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dataflow.cli.support import command_line
 from dataflow.cli.support.arguments import ModuleFolders, OtherGraph, OtherSettings, find_modules_in, graph_file
 from dataflow.cli.support.output import fail, out
 
@@ -72,14 +73,13 @@ RECORDED = CodeOptions()
 def take_environment(threads: int, env: Environment | None = None) -> None:
     """Begins anew with the environment of operators where this process has another one, or in `env`: libraries read the
     number of their threads, and Python the salt of hashes, when they begin."""
-    from dataflow.cli import start
     from dataflow.execution.threads import environment
 
     wanted, python = environment(threads), sys.executable
     if env is not None:
         wanted, python = env.variables(wanted), env.python
-    if start.words is not None and any(
+    if command_line.words is not None and any(
         os.environ.get(name) != value for name, value in wanted.items() if name != "PYTHONPATH"
     ):
         out.file.flush()
-        os.execve(python, [python, "-P", "-m", "dataflow.cli.main", *start.words], wanted)
+        os.execve(python, [python, "-P", "-m", "dataflow.cli.main", *command_line.words], wanted)

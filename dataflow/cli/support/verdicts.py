@@ -194,7 +194,8 @@ def _since(report: VerifyReport, v: Verification) -> str:
     found = list(report.changes.get(v.operator, ()))
     found += ["its code"] * bool(v.code_changed) + ["a file that it read"] * bool(v.files_changed)
     found += ["libraries or the machine"] * bool(report.facts or v.packages_changed)
-    return f"changed since the recording: {', '.join(found)}"
+    unknown = "" if v.code_known else "; perhaps its code, of which the recording has no digests"
+    return f"changed since the recording: {', '.join(found)}{unknown}"
 
 
 def _cut(report: VerifyReport) -> str:

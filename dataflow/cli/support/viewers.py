@@ -12,12 +12,22 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from dataflow.cli.support.output import err, say
+from dataflow.cli.support.output import err, fail, say
 
 READY_WITHIN = 20.0
 """Seconds that a run waits for its viewer's process to be ready before it starts."""
 DRAW_WITHIN = 15.0
 """Seconds that a viewer gets to draw the rest when its run has ended."""
+
+
+def require_display() -> None:
+    """An error, with what to use instead, where no window can be opened."""
+    from dataflow.view.process import display_problem
+
+    if (problem := display_problem()) is not None:
+        raise fail(
+            f"cannot open a viewer window: {problem}; use serve (a page for a browser) or a file name ending in .rrd"
+        )
 
 
 def open_saved(path: Path) -> None:

@@ -9,25 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import invert
-from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, Sightings, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Pixels, Points
+from operators.geometry.pinhole import Points, project_clamped, projection_jacobian
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 NEAR = 1e-3  # of the map's unit; nearer points are behind or in the lens
-
-
-@dataclass(frozen=True, eq=False)
-class Views:
-    """Holds observations: frames (S,) and points (S,) by index, pixels (S, 2)."""
-
-    frames: NDArray[np.int64]
-    points: NDArray[np.int64]
-    pixels: Pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +42,7 @@ class _Errors:
 
 
 def adjust(
-    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, sigma: float, fixed: int, iterations: int
+    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, sigma: float, fixed: int, iterations: int
 ) -> Adjusted:
     """Improves poses T_world_camera (W, 4, 4) after the first `fixed` ones, and points (M, 3) in the world.
 
@@ -74,29 +64,22 @@ def adjust(
     return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, now.squared)
 
 
-def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, sigma: float) -> _Errors:
-    inverse = np.array([invert(T) for T in poses])
-    R = inverse[seen.frames, :3, :3]
-    p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
-    z = np.maximum(p[:, 2], NEAR)
-    u, v = K[0, 0] * p[:, 0] / z + K[0, 2], K[1, 1] * p[:, 1] / z + K[1, 2]
-    r = (np.column_stack([u, v]) - seen.pixels) / sigma
+def _errors(K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, sigma: float) -> _Errors:
+    p, R = seen.in_cameras(poses, points)
+    r = (project_clamped(p, K, NEAR) - seen.pixels) / sigma
     # What lies behind counts as a constant, so that no step gains by putting a point there.
     chi = np.where(p[:, 2] > NEAR, (r * r).sum(axis=1), 1e6)
     return _Errors(r, p, R, float(np.log1p(chi / CAUCHY**2).sum()))
 
 
 def _step(
-    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Views, at: _Errors, sigma: float, fixed: int,
+    K: Matrix, poses: NDArray[np.float64], points: Points, seen: Sightings, at: _Errors, sigma: float, fixed: int,
     damping: float,
 ) -> tuple[NDArray[np.float64], Points]:  # fmt: skip
     """Returns poses and points after a damped step of Gauss and Newton."""
     free = len(poses) - fixed
     p, R, r = at.points, at.rotations, at.residuals
-    z = np.maximum(p[:, 2], NEAR)
-    D = np.zeros((len(p), 2, 3))
-    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z / sigma, -K[0, 0] * p[:, 0] / z**2 / sigma
-    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z / sigma, -K[1, 1] * p[:, 1] / z**2 / sigma
+    D = projection_jacobian(p, K, NEAR) / sigma
     weight = np.where(p[:, 2] > NEAR, cauchy((r * r).sum(axis=1) / CAUCHY**2), 0.0)
     system = PosesAndPoints(
         seen.frames - fixed, seen.points, (free, len(points)), pose_jacobian(D, p), D @ R, r, weight[:, None]

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.estimation.bundle import Sightings
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray, Mask
 from operators.odometry.keyframes import view_distance
-from operators.odometry.mono.adjustment import Views, adjust
+from operators.odometry.mono.adjustment import adjust
 from operators.odometry.mono.two_view import triangulate
 from operators.odometry.tracking import scaled_covariance
 
@@ -166,7 +167,7 @@ class MonoMap:
         views = tuple(replace(v, covariance=scaled_covariance(v.covariance, factor)) for v in known.views)
         return replace(known, views=views)
 
-    def _seen_by(self, views: Sequence[View]) -> tuple[Views, Numbers]:
+    def _seen_by(self, views: Sequence[View]) -> tuple[Sightings, Numbers]:
         """Returns the sightings of points that two of some views saw, and the numbers of these points."""
         frames = np.concatenate([np.full(len(v.numbers), k) for k, v in enumerate(views)])
         numbers = np.concatenate([v.numbers for v in views])
@@ -177,7 +178,7 @@ class MonoMap:
         often = counts >= 2
         place = np.cumsum(often) - 1
         take = often[inverse]
-        return Views(frames[take], place[inverse[take]], pixels[take]), unique[often]
+        return Sightings(frames[take], place[inverse[take]], pixels[take]), unique[often]
 
 
 def found_in(numbers: Numbers, wanted: Numbers) -> tuple[NDArray[np.int64], Mask]:
@@ -188,7 +189,7 @@ def found_in(numbers: Numbers, wanted: Numbers) -> tuple[NDArray[np.int64], Mask
     return rows, np.asarray(numbers[rows] == wanted, np.bool_)
 
 
-def _misfits(squared: NDArray[np.float64], seen: Views, count: int) -> Mask:
+def _misfits(squared: NDArray[np.float64], seen: Sightings, count: int) -> Mask:
     """Returns which points are, in the mean of their sightings or in one of them, far from where they were seen."""
     capped = np.minimum(squared, 1e6)
     times = np.maximum(np.bincount(seen.points, minlength=count), 1)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from operators.estimation.bundle import PosesAndPoints, Sightings, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Points
+from operators.geometry.pinhole import Points, project_clamped, projection_jacobian
 from operators.geometry.se3 import Matrix
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
@@ -49,10 +49,8 @@ class StereoRig:
 
     def project(self, points: Points) -> NDArray[np.float64]:
         """Returns (N, 3) left column, row, right column of points (N, 3) in the left camera; z at least NEAR."""
-        z = np.maximum(points[:, 2], NEAR)
-        u = self.K[0, 0] * points[:, 0] / z + self.K[0, 2]
-        v = self.K[1, 1] * points[:, 1] / z + self.K[1, 2]
-        return np.column_stack([u, v, u - self.K[0, 0] * self.baseline / z])
+        left = project_clamped(points, self.K, NEAR)
+        return np.column_stack([left, left[:, 0] - self.K[0, 0] * self.baseline / np.maximum(points[:, 2], NEAR)])
 
     def triangulate(self, sightings: NDArray[np.float64]) -> Points:
         """Returns points (N, 3) in the left camera of sightings (N, 3) with a positive disparity."""
@@ -63,55 +61,9 @@ class StereoRig:
 
     def jacobian(self, points: Points) -> NDArray[np.float64]:
         """Returns d sighting / d point (N, 3, 3)."""
-        x, y = points[:, 0], points[:, 1]
-        z = np.maximum(points[:, 2], NEAR)
-        fx, fy = self.K[0, 0], self.K[1, 1]
-        J = np.zeros((len(points), 3, 3))
-        J[:, 0, 0] = J[:, 2, 0] = fx / z
-        J[:, 0, 2] = -fx * x / z**2
-        J[:, 2, 2] = -fx * (x - self.baseline) / z**2
-        J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * y / z**2
+        J = projection_jacobian(points, self.K, NEAR).take([0, 1, 0], axis=1)
+        J[:, 2, 2] = -self.K[0, 0] * (points[:, 0] - self.baseline) / np.maximum(points[:, 2], NEAR) ** 2
         return J
-
-
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """Holds observations: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
-
-    frames: NDArray[np.int64]
-    points: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-
-    @staticmethod
-    def none() -> "Sightings":
-        return Sightings(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
-
-    def also(self, frame: int, points: NDArray[np.int64], pixels: NDArray[np.float64]) -> "Sightings":
-        """Adds what one frame sees: points (N,) at pixels (N, 3)."""
-        return Sightings(
-            np.concatenate([self.frames, np.full(len(points), frame)]),
-            np.concatenate([self.points, points]),
-            np.concatenate([self.pixels, pixels]),
-        )
-
-    def of_points(self, kept: NDArray[np.int64]) -> "Sightings":
-        """Returns the sightings of the points kept, numbered anew."""
-        number = np.full(max(int(self.points.max(initial=-1)), int(kept.max(initial=-1))) + 1, -1, np.int64)
-        number[kept] = np.arange(len(kept))
-        there = number[self.points] >= 0
-        return Sightings(self.frames[there], number[self.points[there]], self.pixels[there])
-
-    def without_first(self) -> "Sightings":
-        """Returns the sightings of all frames but the first."""
-        later = self.frames > 0
-        return Sightings(self.frames[later] - 1, self.points[later], self.pixels[later])
-
-    def fitting(self, squared: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
-        """Returns which of `count` points are seen, and in the mean of their squared errors (S,) fit."""
-        total = np.zeros(count)
-        times = np.bincount(self.points, minlength=count)
-        np.add.at(total, self.points, squared)
-        return np.asarray((times > 0) & (total < 12.0 * np.maximum(times, 1)), np.bool_)
 
 
 @dataclass(frozen=True)
@@ -190,13 +142,19 @@ class Adjusted:
     past: Past
 
 
+def fitting(seen: Sightings, squared: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
+    """Returns which of `count` points are seen, and in the mean of their squared errors (S,) fit."""
+    total = np.zeros(count)
+    times = np.bincount(seen.points, minlength=count)
+    np.add.at(total, seen.points, squared)
+    return np.asarray((times > 0) & (total < 12.0 * np.maximum(times, 1)), np.bool_)
+
+
 def linearised(
     rig: StereoRig, poses: NDArray[np.float64], points: Points, seen: Sightings, offset: float, sigma: float, fixed: int
 ) -> tuple[PosesAndPoints, NDArray[np.float64]]:
     """Returns the sightings of points (M, 3) from poses (W, 4, 4) linearised, and their squared errors (S,)."""
-    inverse = np.array([invert(T) for T in poses])
-    R = inverse[seen.frames, :3, :3]
-    p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
+    p, R = seen.in_cameras(poses, points)
     r = (rig.project(p) - seen.pixels + np.array([0.0, 0.0, offset])) / sigma
     squared = np.einsum("si,si->s", r, r)
     weight = np.where(p[:, 2] > NEAR, cauchy(squared / (3.0 * CAUCHY**2)), 0.0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.estimation.bundle import Sightings
 from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.monitoring.image_flaws import Watch
@@ -19,7 +20,7 @@ from operators.odometry.images import check_image, gray_of
 from operators.odometry.keyframes import RECALL_NEAR, RECALL_OTHERS, candidates, recall_due
 from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
-from operators.odometry.stereo.adjustment import Offset, Past, Sightings, StereoRig, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, StereoRig, adjust, fitting
 from operators.odometry.stereo.map import StereoMap
 from operators.odometry.stereo.relocalizer import TYPICAL, RelocalizedPose, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -73,7 +74,7 @@ class StereoState:
     poses: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # T_world_camera of the window
     points: Points = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) in the world
     pixels: Pixels = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where the last image shows them
-    seen: Sightings = field(default_factory=Sightings.none)
+    seen: Sightings = field(default_factory=lambda: Sightings.none(3))
     offset: Offset = field(default_factory=Offset)
     past: Past = field(default_factory=lambda: Past.none(np.zeros((0, 4, 4)), 0.0))  # of the window's poses
     map: StereoMap = field(default_factory=StereoMap)
@@ -154,7 +155,7 @@ class StereoOdometry:
         adjusted = adjust(self.rig, poses, points, seen, state.offset, past, config.sigma, fixed, config.iterations)
         T = adjusted.poses[-1]
         ahead = transform_points(invert(T), adjusted.points)[:, 2] > 0.3
-        good = seen.fitting(adjusted.squared, len(points)) & ahead
+        good = fitting(seen, adjusted.squared, len(points)) & ahead
         misfit = max(1.0, float(np.median(adjusted.squared)) / 2.37)
         step = SYSTEMATIC * misfit * np.linalg.inv(adjusted.information + 1e-6 * np.eye(6))
         status = Status.RELOCALISED if self._lost else Status.TRACKING

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import invert
-from operators.estimation.bundle import PosesAndPoints, pose_jacobian
+from dataflow.messages.geometry import transform_points
+from operators.estimation.bundle import PosesAndPoints, Sightings, pose_jacobian
 from operators.estimation.kernels import cauchy
 from operators.estimation.least_squares import gauss_newton_step
 from operators.geometry import se3
-from operators.geometry.pinhole import Points
+from operators.geometry.pinhole import Points, project_clamped, projection_jacobian
 from operators.odometry.rgbd.camera import RgbdCamera
 from operators.odometry.rgbd.fitting import Fitter, systematic
 from operators.slam import motions
@@ -45,13 +45,10 @@ WRONG = 25.0  # squared sigmas of a pixel beyond which a sighting is of somethin
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
-    """Observations of point (S,) by view (S,), at what pixel (S, 2) of the colour camera and depth (S,) in the depth
-    camera, metres, NaN where unknown; and how noisy a pixel is and each depth (S,)."""
+class Observations(Sightings):
+    """Sightings at pixels (S, 2) of the colour camera with depths (S,) in the depth camera, metres, NaN where unknown;
+    and how noisy a pixel is and each depth (S,)."""
 
-    views: Indices
-    points: Indices
-    pixels: Array
     depths: Array
     sigma_pixel: float
     sigma_depths: Array
@@ -101,14 +98,10 @@ class _Solver:
     def residuals(self, poses: Array, points: Points) -> tuple[Array, Array, Array, Array]:
         """Returns points in the depth cameras (S, 3), residuals (S, 3) in sigmas, their squares (S, 2), R (S, 3, 3)."""
         seen, K, T_color = self.seen, self.camera.K_color, self.camera.T_color_depth
-        inverse = invert(poses)
-        R = inverse[seen.views, :3, :3]
-        p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.views, :3, 3]
-        c = p @ T_color[:3, :3].T + T_color[:3, 3]
-        z = np.maximum(c[:, 2], NEAR)
+        p, R = seen.in_cameras(poses, points)
+        c = transform_points(T_color, p)
         r = np.empty((len(p), 3))
-        r[:, 0] = (K[0, 0] * c[:, 0] / z + K[0, 2] - seen.pixels[:, 0]) / seen.sigma_pixel
-        r[:, 1] = (K[1, 1] * c[:, 1] / z + K[1, 2] - seen.pixels[:, 1]) / seen.sigma_pixel
+        r[:, :2] = (project_clamped(c, K, NEAR) - seen.pixels) / seen.sigma_pixel
         r[:, 2] = np.where(self.known, (p[:, 2] - self.depths) / seen.sigma_depths, 0.0)
         squared = np.column_stack([r[:, 0] ** 2 + r[:, 1] ** 2, r[:, 2] ** 2])
         squared[c[:, 2] <= NEAR] = np.inf
@@ -120,27 +113,17 @@ class _Solver:
         p, r, squared, R = self.residuals(poses, points)
         w = self.strength * cauchy(squared / CAUCHY**2)
         weights = np.column_stack([w[:, 0], w[:, 0], np.where(self.known, w[:, 1], 0.0)])
-        J = self._derivatives(p)
-        system = PosesAndPoints(seen.views - fixed, seen.points, (count, size), pose_jacobian(J, p), J @ R, r, weights)
+        T_color, J = self.camera.T_color_depth, np.zeros((len(p), 3, 3))
+        by_color = projection_jacobian(transform_points(T_color, p), self.camera.K_color, NEAR)
+        J[:, :2] = by_color / seen.sigma_pixel @ T_color[:3, :3]
+        J[:, 2, 2] = 1.0 / seen.sigma_depths
+        system = PosesAndPoints(seen.frames - fixed, seen.points, (count, size), pose_jacobian(J, p), J @ R, r, weights)
         system.damp_points(0.0, 1e-6)
         S, g = system.reduced()
         of_edges, pull = graph.normal(poses)
         x = gauss_newton_step(S + of_edges, g + pull)
         points = points + system.points_step(x)
         return poses[fixed:] @ motions.exps(x.reshape(count, 6)), points, float(np.abs(x).max(initial=0.0))
-
-    def _derivatives(self, p: Array) -> Array:
-        """Returns d residuals / d p (S, 3, 3), of points in the depth cameras."""
-        K, T = self.camera.K_color, self.camera.T_color_depth
-        c = p @ T[:3, :3].T + T[:3, 3]
-        z = np.maximum(c[:, 2], NEAR)
-        D = np.zeros((len(p), 3, 3))
-        D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * c[:, 0] / z**2
-        D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * c[:, 1] / z**2
-        D[:, :2] /= self.seen.sigma_pixel
-        D[:, :2] = D[:, :2] @ T[:3, :3]
-        D[:, 2, 2] = 1.0 / self.seen.sigma_depths
-        return D
 
 
 def adjust_newest(graph: KeyframeGraph[View], points: MapPoints, fitter: Fitter, newest: int) -> None:

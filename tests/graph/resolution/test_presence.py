@@ -55,7 +55,7 @@ def test_everything_is_there_where_every_input_is_given() -> None:
     assert taken(graph, "part/mapper", "cloud") == ("part/builder/cloud",)
 
 
-def test_an_operator_without_an_input_that_it_needs_is_left_out_with_all_that_needs_it() -> None:
+def test_operator_without_required_input_is_left_out_with_its_dependents() -> None:
     graph = outer("")
     assert "part/builder" not in graph.nodes
     assert "part/mapper" not in graph.nodes
@@ -82,7 +82,7 @@ def test_the_first_way_that_is_there_is_taken_also_through_exported_outputs() ->
     assert "outer/part/cloud" not in outer("", more).aliases
 
 
-def test_a_file_that_names_what_its_own_omission_removes_has_a_fault() -> None:
+def test_input_from_a_left_out_operator_is_a_fault() -> None:
     more = '  echo: {use: "graph_operators:Mapper", inputs: {cloud: part/cloud, pose: part/pose}}\n'
     assert faults("", more) == [
         "echo.cloud: 'part/cloud' is not made: part is not given its input 'cloud'; part is not given its input 'depth'"
@@ -152,7 +152,7 @@ operators:
     assert "part/odometry" in load_text(text, files={"part.yaml": PART}, settings=["more=true"]).nodes
 
 
-def test_what_is_left_out_is_the_same_from_a_bundle_and_from_json() -> None:
+def test_left_out_operators_survive_bundle_and_json() -> None:
     graph = outer("")
     again = load_bundle(graph.bundle())
     assert again.left_out == graph.left_out

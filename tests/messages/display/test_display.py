@@ -72,7 +72,7 @@ def test_depth_without_any_return_is_black() -> None:
     assert not decoded(DepthImage(stamp=1, frame="c", data=np.zeros((2, 2), np.float32))).any()
 
 
-def test_classes_have_colours_of_their_own() -> None:
+def test_classes_have_distinct_colours() -> None:
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
     shown = decoded(SegmentationMap(stamp=1, frame="c", class_names=tuple("abcdefghijkl"), classes=classes))
 

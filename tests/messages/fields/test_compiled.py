@@ -104,7 +104,7 @@ def test_the_digest_of_large_arrays_is_the_documented_one(first: int, second: in
     assert message.digest() == documented_digest(message)
 
 
-def test_the_constructor_accepts_and_refuses_what_the_general_one_does() -> None:
+def test_compiled_constructor_agrees_with_the_general_one() -> None:
     for cls, seed in itertools.product(TYPES, (0, 2)):
         values = dict(example(cls, seed).items())
         for name in values:
@@ -136,7 +136,7 @@ def test_equal_symbols_mean_equal_extents() -> None:
         assert outcome(Pair, {"stamp": 1, **arrays}) == expected, shapes
 
 
-def test_what_is_given_stays_the_givers() -> None:
+def test_message_copies_its_arrays() -> None:
     given_array = np.ones((2, 1))
     message = Large(stamp=1, first=np.zeros(2, np.uint8), third=given_array)
     given_array[:] = 5

@@ -233,7 +233,7 @@ def test_a_camera_beside_an_imu_is_found(tmp_path: Path) -> None:
         ("camera nowhere.mcap --square 0.03 --chessboard 9x6", "no recording nowhere.mcap"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(line: str, wrong: str, pair: Path, tmp_path: Path) -> None:
+def test_invalid_calibration_command_is_refused_in_one_line(line: str, wrong: str, pair: Path, tmp_path: Path) -> None:
     assert wrong in run(f"{line.replace('PAIR', str(pair))} --out {tmp_path}", code=2)
     assert not list(tmp_path.iterdir())
 

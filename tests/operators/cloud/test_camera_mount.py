@@ -149,7 +149,7 @@ def test_a_view_of_a_lost_odometry_does_not_decide() -> None:
     assert mount.process(cloud(room(28, 0), 1)) is not None
 
 
-def test_the_ground_that_a_view_before_showed_counts_where_the_one_that_decides_shows_none(
+def test_ground_of_an_earlier_view_counts_if_the_last_shows_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     up, sure = np.array([0.0, -1.0, 0.0]), np.eye(3) * np.radians(0.5) ** 2
@@ -186,13 +186,13 @@ def test_the_base_holds_all_cameras_whichever_is_the_parent(pair: tuple[str, str
 
 @pytest.mark.parametrize("at", [1, 2], ids=["before it is decided", "after"])
 @pytest.mark.parametrize("first", [NOTHING, room(28, 5, floor=False)[:6000]], ids=["nothing", "a single wall"])
-def test_mounts_repeat_and_a_restored_one_knows_since_when_and_the_best_view(first: Array, at: int) -> None:
+def test_restored_mount_repeats_with_its_period_and_best_view(first: Array, at: int) -> None:
     calls = [(cloud(first),), (cloud(NOTHING, 2_000_000_000),), (cloud(room(28, 5), 3_000_000_000),)]
     made = assert_repeats(CameraMount, calls, at)
     assert [sorted(each) for each in made] == [[], ["base_extrinsics", "status"], []]
 
 
-def test_a_clock_that_begins_anew_decides_anew() -> None:
+def test_clock_reset_restarts_the_mount_estimate() -> None:
     mount = CameraMount()
     before = mount.process(cloud(room(28, 0), 9))
     mount.on_reset("cloud")

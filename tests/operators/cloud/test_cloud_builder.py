@@ -63,7 +63,7 @@ def test_missing_and_out_of_range_depths_make_no_points() -> None:
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
-def test_what_lies_beside_a_missing_return_is_no_edge(nothing: float) -> None:
+def test_missing_return_makes_no_depth_edge(nothing: float) -> None:
     depth = np.full((HEIGHT, WIDTH), 2.0)
     depth[20, 30] = nothing
     assert len(build(depth).points) == WIDTH * HEIGHT - 1
@@ -159,7 +159,7 @@ def test_status_counts_pixels_and_points(depth: float, focal: float, text: str) 
     assert int(status.levels[0]) == (0 if text.endswith("pixels") else 1)
 
 
-def test_what_does_not_fit_is_named() -> None:
+def test_mismatched_input_is_refused_with_the_mismatch() -> None:
     builder, image, depth = CloudBuilder(), position_image(), depth_image(np.ones((HEIGHT, WIDTH)))
     with pytest.raises(ValueError, match="depth has 10x10 pixels, but depth_info describes 64x48"):
         builder.process(depth_image(np.ones((10, 10))), image, info("depth"), info("color"))

@@ -54,7 +54,7 @@ def test_unseen_points_are_left_out_with_their_fields_where_that_is_asked_for() 
     assert cloud.intensities.tolist() == [3, 4, 5]
 
 
-def test_what_something_nearer_hides_is_not_coloured() -> None:
+def test_occluded_points_are_not_coloured() -> None:
     behind = [[0, 0, 2], [0.1, 0, 6], [0, 0, 2.1]]
     for slack, expected in ((0.1, [True, False, True]), (0.0, [True, True, True])):
         cloud = colored(behind, slack=slack)["colored"][0]
@@ -84,7 +84,7 @@ def test_an_empty_cloud_is_a_warning() -> None:
         ({"classes": np.zeros((3, 4), np.uint8)}, r"classes have \(3, 4\) pixels"),
     ],
 )
-def test_what_does_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
+def test_mismatched_input_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(Exception, match=message):
         colored(SEEN, **change)
 

@@ -33,7 +33,7 @@ def room(seed: int = 0) -> np.ndarray:
     return points * [2, 2, 1]
 
 
-def test_range_and_box_keep_what_lies_in_them() -> None:
+def test_range_and_box_keep_the_points_inside() -> None:
     points = [[0.1, 0, 0], [1, 0, 0], [3, 0, 0], [0, 1, 0], [9, 0, 0], [np.nan, 0, 0], [np.inf, 0, 0]]
     box = {"lower": (0.5, -0.5, -0.5), "upper": (20.0, 0.5, 0.5)}
     out, counts = filtered(cloud(points), min_range=0.5, max_range=5.0, **box)
@@ -44,7 +44,7 @@ def test_range_and_box_keep_what_lies_in_them() -> None:
     assert counts["kept"] == "2"
 
 
-def test_a_voxel_has_the_mean_of_its_points_and_of_what_is_known_of_them() -> None:
+def test_voxel_holds_the_means_of_points_colors_and_intensities() -> None:
     points = [[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1]]
     given_cloud = cloud(
         points,
@@ -59,7 +59,7 @@ def test_a_voxel_has_the_mean_of_its_points_and_of_what_is_known_of_them() -> No
     assert out.rings is None
 
 
-def test_chosen_points_of_an_organised_cloud_keep_their_precise_coordinates_and_no_rows() -> None:
+def test_filtered_organised_cloud_keeps_precise_coordinates_and_loses_rows() -> None:
     points = np.array([[1.0, 0, 0], [9, 0, 0], [2, 0, 0], [3, 0, 0]])
     out, _ = filtered(cloud(points, precise=points + 1e6, columns=2), max_range=5.0)
     assert (out.columns, out.precise.tolist()) == (None, (points[[0, 2, 3]] + 1e6).tolist())

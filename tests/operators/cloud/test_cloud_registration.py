@@ -105,7 +105,7 @@ def test_long_room_is_registered_along_its_length() -> None:
     assert explained_at_the_truth(scan(A, 1, niches, long), scan(B, 2, niches, long), A, B).reason == ""
 
 
-def test_surfaces_that_agree_well_make_up_for_a_little_fitness_and_others_are_not_believed() -> None:
+def test_agreeing_surfaces_compensate_low_fitness() -> None:
     A, B = at(0.2, 0.1, 0.0), at(0.9, -0.2, 0.6)
     source, target = (Prepared.of_cloud(scan(T, k, BOXES).astype(np.float32), 0.1) for k, T in enumerate((B, A)))
     T = invert(A) @ B
@@ -149,7 +149,7 @@ def test_a_motion_is_believed_where_no_other_one_explains_as_much(other: Registe
     assert bool(found.reason) is ambiguous
 
 
-def test_what_lies_on_a_surface_does_not_hang_in_free_space() -> None:
+def test_coarse_floor_voxels_do_not_violate_free_space() -> None:
     """Coarse voxels of a wide floor, seen at a low angle, lie before what is seen in directions beside theirs."""
     boxes = np.array([[x, y, 0.6, 0.4, 0.4, 0.6] for x in (-6, -2, 3, 7) for y in (-3, 3.5)])
     A, B = at(0.2, 0.1, 0.0), at(2.5, 0.1, 0.3)

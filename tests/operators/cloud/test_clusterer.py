@@ -162,7 +162,7 @@ def bookcase(rng: np.random.Generator, x: float = 2.0) -> np.ndarray:
     )
 
 
-def test_what_stands_on_boards_is_apart_from_them_and_from_what_stands_on_others() -> None:
+def test_objects_on_shelf_boards_are_separate_clusters() -> None:
     rng = np.random.default_rng(0)
     parts = [
         bookcase(rng),

@@ -98,7 +98,7 @@ def test_floor_walls_and_table_are_found_with_their_planes_and_points() -> None:
     assert 110 <= rest.count <= 200  # the ball, and little else
 
 
-def test_the_rectangle_of_a_table_is_what_is_seen_of_it() -> None:
+def test_table_rectangle_covers_its_visible_part() -> None:
     T = optical()
     _, surfaces, _ = segmented(cloud(room(), T), T)
     k = surfaces.labels().index("table")
@@ -107,7 +107,7 @@ def test_the_rectangle_of_a_table_is_what_is_seen_of_it() -> None:
     np.testing.assert_allclose(center, [1.8, -0.8, 0.75], atol=0.03)
 
 
-def test_the_hull_of_a_plane_is_what_is_seen_of_it() -> None:
+def test_plane_hull_covers_its_visible_part() -> None:
     T, parts = optical(), room()
     corner = parts["table"][:, 0] + parts["table"][:, 1] > 1.6  # a table that lacks one
     parts["table"] = parts["table"][~corner]
@@ -218,7 +218,7 @@ def test_segmenters_repeat_and_a_restored_one_remembers_the_floor() -> None:
     assert_repeats(PlaneSegmenter, [(cloud(each, T, k), pose(T, k)) for k, each in enumerate(parts, 1)], 2)
 
 
-def test_clouds_within_the_period_are_left_out_and_a_restored_operator_knows_the_last() -> None:
+def test_clouds_within_the_period_are_skipped_also_after_restoring() -> None:
     T, second = optical(), 1_000_000_000
     stamps = [1, second // 2, second + 1, second + 2]
     calls = [(cloud(room(seed=k), T, stamp), pose(T, stamp)) for k, stamp in enumerate(stamps)]

@@ -27,7 +27,7 @@ def depth_file(levels: np.ndarray) -> np.ndarray:
     return cv2.imencode(".png", levels)[1].reshape(-1)
 
 
-def test_png_comes_back_bit_by_bit() -> None:
+def test_png_decodes_bit_for_bit() -> None:
     message = CompressedImage(stamp=STAMP, frame="cam", format="png", data=encoded(ramp(), ".png"))
     assert ImageDecoder().decode(message) == Image(stamp=STAMP, frame="cam", data=ramp())
 

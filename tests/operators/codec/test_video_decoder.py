@@ -104,7 +104,7 @@ def test_the_images_are_the_same_in_every_placement_and_verify(recorded: Path, t
 
 
 @pytest.mark.long
-def test_a_replay_from_the_middle_goes_on_with_the_same_images(recorded: Path, tmp_path: Path) -> None:
+def test_replay_from_the_middle_decodes_the_same_images(recorded: Path, tmp_path: Path) -> None:
     replay(recorded, placement="one_process", record=tmp_path / "later.mcap", start=(WITHIN - 10**9) * 1e-9)
     whole = images(recorded)
     assert images(tmp_path / "later.mcap") == {stamp: digest for stamp, digest in whole.items() if stamp >= WITHIN}

@@ -99,7 +99,7 @@ def test_a_wall_has_its_depth_to_a_fraction_of_a_pixel(disparity: float) -> None
     assert np.percentile(np.abs(found - disparity), 99) < 0.5
 
 
-def test_what_only_one_camera_sees_has_no_return() -> None:
+def test_pixels_seen_by_one_camera_have_no_depth() -> None:
     left, right, truth, hidden = step_pair()
     played = measured(left, right)
     depth = depth_of(played)

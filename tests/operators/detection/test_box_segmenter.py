@@ -71,7 +71,7 @@ def detections(width: int = WIDTH) -> Detections2D:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 @pytest.mark.parametrize("half", [False, True], ids=["float32", "float16"])
 @pytest.mark.parametrize("many", [True, False], ids=["all boxes at once", "one by one"])
-def test_each_box_gets_what_is_bright_in_it(tmp_path: Path, many: bool, half: bool) -> None:
+def test_each_box_is_masked_by_its_bright_pixels(tmp_path: Path, many: bool, half: bool) -> None:
     made = BoxSegmenter(model=exported(tmp_path / "m.onnx", many=many, half=half), most=2)
     made.setup()
     given = detections()
@@ -174,7 +174,7 @@ def exported_pair(folder: Path, side: int, *, pixels: bool, multiple: bool) -> d
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("multiple", [False, True], ids=["one mask", "all masks"])
 @pytest.mark.parametrize(("side", "pixels"), [(64, False), (1024, True)], ids=["padded", "pixels"])
-def test_an_encoder_and_a_decoder_in_two_files_give_what_is_bright_in_each_box(
+def test_encoder_and_decoder_in_two_files_mask_the_bright_pixels_of_each_box(
     tmp_path: Path, side: int, pixels: bool, multiple: bool
 ) -> None:
     made = BoxSegmenter(**exported_pair(tmp_path, side, pixels=pixels, multiple=multiple))

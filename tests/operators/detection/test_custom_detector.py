@@ -354,7 +354,7 @@ def test_broken_json_is_named_with_its_line(tmp_path: Path) -> None:
         read_detection_data(tmp_path)
 
 
-def test_a_folder_of_neither_format_says_what_is_expected(tmp_path: Path) -> None:
+def test_folder_of_neither_format_is_refused_with_the_expected_formats(tmp_path: Path) -> None:
     (tmp_path / "photo.txt").write_text("")
     with pytest.raises(DataError, match=r"neither COCO .* nor YOLO .*it holds photo\.txt"):
         read_detection_data(tmp_path)
@@ -436,7 +436,7 @@ def test_an_encoded_box_is_decoded(level: int, anchor: int, label: int, seed: in
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.01, 0.3, 0.6])
-def test_what_is_trained_is_what_is_decoded(threshold: float) -> None:
+def test_training_and_operator_decode_the_output_alike(threshold: float) -> None:
     """The loss and the operator read the network's output alike: two implementations, random maps."""
     rng = np.random.default_rng(0)
     maps = [rng.normal(0, 2, (1, 3 * 9, 128 // s, 160 // s)).astype(np.float32) for s in STRIDES]
@@ -569,7 +569,7 @@ def test_boxes_follow_the_pixels_through_every_variation(tmp_path: Path, seed: i
     np.testing.assert_allclose(seen.boxes[0], around, atol=1.01)
 
 
-def test_without_variation_training_sees_what_the_operator_sees(tmp_path: Path) -> None:
+def test_training_without_variation_sees_the_operators_input(tmp_path: Path) -> None:
     from operators.image.letterbox import ImageFit
 
     for size, target in (((640, 480), (320, 240)), ((200, 120), (160, 128)), ((100, 160), (160, 128))):
@@ -655,7 +655,7 @@ def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = 
     return file, network
 
 
-def test_the_file_computes_what_the_trained_network_computes(tmp_path: Path) -> None:
+def test_exported_file_agrees_with_the_trained_network(tmp_path: Path) -> None:
     file, network = exported(tmp_path)
     pixels = scene(4)[0]
     with torch.inference_mode():

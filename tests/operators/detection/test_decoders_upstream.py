@@ -126,7 +126,7 @@ def test_nanodet_as_its_head_in_torch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["float32", "float16"])
-def test_rtdetr_gives_the_boxes_of_its_own_postprocessor(tmp_path: Path, kind: str) -> None:
+def test_rtdetr_boxes_match_its_reference_postprocessor(tmp_path: Path, kind: str) -> None:
     """`bbox_pred *= orig_target_sizes.repeat(1, 2)`: pixels of the size that it is given, width first."""
     rng = np.random.default_rng(3)
     low, extent = rng.uniform(0, 0.6, (1, 9, 2)), rng.uniform(0.1, 0.3, (1, 9, 2))
@@ -323,7 +323,7 @@ def test_rows_that_fill_up_an_export_are_no_objects(tmp_path: Path) -> None:
         ("tensorflow", {"a": np.zeros((1, 3, 9), np.float32)}, r"outputs of TensorFlow's detectors"),
     ],
 )
-def test_outputs_of_another_family_are_refused_with_what_would_be_right(
+def test_outputs_of_another_model_family_are_refused_with_a_hint(
     tmp_path: Path, decoder: str, outputs: dict[str, np.ndarray], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=reason):

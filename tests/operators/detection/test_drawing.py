@@ -49,7 +49,7 @@ def test_a_mask_tints_its_pixels_alone() -> None:
     assert (drawn[60:75, 30:40] == 90).all()
 
 
-def test_a_grey_image_becomes_a_coloured_one_and_without_detections_nothing_is_drawn() -> None:
+def test_grey_image_without_detections_is_converted_to_colour_unmarked() -> None:
     drawn = draw_detections(grey((90, 120)), detections([]))
     assert drawn.data.shape == (90, 120, 3)
     assert (drawn.data == 90).all()

@@ -44,7 +44,7 @@ def test_the_order_of_the_boxes_does_not_matter_even_with_ties(seed: int, count:
 
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, COUNTS, THRESHOLDS)
-def test_what_is_kept_does_not_overlap_and_what_is_dropped_does(seed: int, count: int, threshold: float) -> None:
+def test_kept_boxes_do_not_overlap_and_dropped_ones_do(seed: int, count: int, threshold: float) -> None:
     boxes, scores, classes = random_boxes(seed, count)
     kept = class_wise_nms(boxes, scores, classes, threshold).tolist()
     for i in range(count):
@@ -76,9 +76,7 @@ def test_boxes_without_area_overlap_nothing() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, COUNTS, THRESHOLDS, st.integers(1, 30))
-def test_merging_keeps_the_same_boxes_in_any_order_but_those_that_it_moves_onto_better_ones(
-    seed: int, count: int, threshold: float, most: int
-) -> None:
+def test_merging_nms_is_independent_of_the_box_order(seed: int, count: int, threshold: float, most: int) -> None:
     boxes, scores, classes = random_boxes(seed, count)
     shuffle = np.random.default_rng(seed + 1).permutation(count)
     kept, merged = merging_nms(boxes, scores, classes, threshold, most)

@@ -131,7 +131,7 @@ def test_grey_images_and_images_without_objects_are_fine(tmp_path: Path) -> None
     assert made.process(black).boxes.shape == (0, 4)
 
 
-def test_a_missing_model_says_where_it_was_looked_for(tmp_path: Path) -> None:
+def test_missing_model_error_names_the_searched_path(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=rf"looked for {tmp_path}/none\.onnx"):
         detector(model=str(tmp_path / "none.onnx"), decoder="fastestdet")
 
@@ -148,7 +148,7 @@ def test_a_decoder_that_does_not_fit_the_model_is_named(tmp_path: Path) -> None:
         made.process(red())
 
 
-def test_the_name_of_a_model_stands_for_its_file_and_is_what_the_record_holds() -> None:
+def test_model_name_resolves_to_its_file_and_is_recorded() -> None:
     named, made = detector(model="simulated"), CustomDetector()
     made.setup()
     rng = np.random.default_rng(0)
@@ -160,7 +160,7 @@ def test_the_name_of_a_model_stands_for_its_file_and_is_what_the_record_holds() 
     assert not OnnxDetector.trained_in_simulation({"model": "yolox_nano"})
 
 
-def test_a_named_model_that_is_not_here_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_named_model_error_gives_the_download_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path))
     where = rf"looked for {tmp_path}/yolox_nano\.onnx\)"
     with pytest.raises(FileNotFoundError, match=rf"{where}.*dataflow models get yolox_nano"):
@@ -188,7 +188,7 @@ def test_class_names_are_those_of_the_models_metadata(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
-def test_fastestdet_finds_what_is_in_real_photographs(data_dir: Path) -> None:
+def test_fastestdet_detects_objects_in_real_photographs(data_dir: Path) -> None:
     """About half of the boxes of this small network overlap a label of their class by more than half."""
     folder = data_dir / "coco128"
     options = {"model": str(data_dir / "models" / "FastestDet.onnx"), "decoder": "fastestdet", "score_threshold": 0.6}

@@ -51,7 +51,7 @@ def detector(**params: Any) -> OnnxDetector:
     return made
 
 
-def test_it_finds_what_is_named_as_its_authors_read_the_outputs(named: str) -> None:
+def test_named_classes_are_decoded_as_by_the_reference(named: str) -> None:
     message = detector(model=named, classes="red, blue").process(IMAGE)
     logits = np.array(COLORS)[:, [0, 2]]  # post_process_object_detection: the sigmoid of the best logit of each box
     scores = 1 / (1 + np.exp(-logits.max(axis=1)))

@@ -106,7 +106,7 @@ def again(file: Path, pixels: NDArray[np.uint8], found: Candidates) -> Candidate
 # ---- what it sees
 
 
-def test_a_closeup_shows_what_is_in_its_window() -> None:
+def test_closeup_shows_the_pixels_of_its_window() -> None:
     pixels = np.zeros((60, 100, 3), np.uint8)
     pixels[20:40, 30:50] = (255, 128, 0)
     whole = closeups(pixels, np.array([[20, 10, 60, 50]], np.float32), 40)[0]
@@ -269,7 +269,7 @@ def test_a_detector_with_a_refiner_repeats_itself_and_keeps_to_its_threshold(ref
     assert (few.scores >= 0.3).all()
 
 
-def test_the_file_computes_what_the_trained_network_computes(refined: Refined) -> None:
+def test_exported_file_agrees_with_the_trained_network(refined: Refined) -> None:
     plain, file, data = refined
     task = RefinerTask(data, plain, variation=GENTLE)
     task.network.load_state_dict(load_safely(file.with_suffix(".refiner.pt"))["ema"])
@@ -338,7 +338,7 @@ def test_a_box_is_of_the_object_of_its_class_that_it_overlaps_most() -> None:
     assert np.array_equal(wanted[:2], truth[:2])
 
 
-def test_what_is_learned_from_shows_the_objects_mirrored_or_not(refined: Refined) -> None:
+def test_training_closeups_show_the_objects_mirrored_or_not(refined: Refined) -> None:
     plain, _, data = refined
     task = RefinerTask(data, plain, variation=GENTLE)
     red = left = 0
@@ -367,9 +367,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(refined: Refined, tmp_p
 
 
 @pytest.mark.long
-def test_a_refiner_is_not_trained_for_other_classes_nor_resumed_for_another_detector(
-    refined: Refined, tmp_path: Path
-) -> None:
+def test_refiner_refuses_other_classes_and_another_detector(refined: Refined, tmp_path: Path) -> None:
     plain, _, data = refined
     other = untrained(tmp_path, ("crate", "ball", "lamp"))
     with pytest.raises(TrainingFileError, match=r"has crate, ball, lamp; the data have crate, ball"):

@@ -85,12 +85,12 @@ def test_a_lower_threshold_is_not_cut_off_by_the_model(checkpoint: Path) -> None
         ({"model": NAME, "device": "gpu"}, "device 'gpu' is unknown"),
     ],
 )
-def test_what_is_not_there_is_named_with_what_is(params: dict[str, str], words: str) -> None:
+def test_unknown_choice_is_refused_with_the_available_ones(params: dict[str, str], words: str) -> None:
     with pytest.raises(OperatorFailure, match=words):
         play(TorchvisionDetector(**params), {"image": [image()]})
 
 
-def test_missing_weights_are_said_with_the_way_to_get_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_error_gives_the_download_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(OperatorFailure, match=rf"looked for {tmp_path}.*ssdlite320.*get them with"):
         play(TorchvisionDetector(model=NAME), {"image": [image()]})

@@ -148,7 +148,7 @@ def test_cameras_that_do_not_fit_are_named(
         play(made, streams(*(image(f) for f in frames)))
 
 
-def test_two_images_of_one_frame_and_stamp_are_refused_and_a_derived_class_has_more_outputs(
+def test_rig_refuses_two_images_of_one_frame_and_takes_seven_cameras(
     checkpoints: dict[str, str],
 ) -> None:
     made = TorchvisionRigDetector(model=SSD, checkpoint=checkpoints[SSD], cameras=("front",))

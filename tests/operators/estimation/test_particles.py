@@ -30,7 +30,7 @@ WEIGHTS = arrays(np.float64, st.integers(1, 40), elements=st.floats(0.001, 1.0))
 
 
 @given(WEIGHTS, st.integers(1, 500), st.floats(0, 0.999))
-def test_systematic_resampling_draws_every_particle_as_often_as_its_share_says(
+def test_systematic_resampling_draws_particles_in_proportion_to_weight(
     weights: np.ndarray, count: int, offset: float
 ) -> None:
     drawn = np.bincount(systematic(weights, count, offset), minlength=len(weights))

@@ -87,7 +87,7 @@ def test_frames_matched_as_they_come_score_as_all_of_them_together(
         assert scores[name].detections == sum(one.labels.count(name) for one in frames)
 
 
-def test_the_operating_point_is_a_precision_and_recall_of_its_own_iou() -> None:
+def test_operating_point_uses_its_iou_and_score_thresholds() -> None:
     box = np.array([[0.0, 0.0, 10.0, 10.0]])
     aside = np.array([[0.0, 0.0, 10.0, 6.0]])  # IoU 0.6
     one = ScoredFrame(box, ("mug",), np.zeros(1, np.bool_), aside, ("mug",), np.array([0.5], np.float32))

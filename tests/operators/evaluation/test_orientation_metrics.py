@@ -12,7 +12,7 @@ from operators.evaluation import OrientationMetrics
 from operators.evaluation.orientation_metrics import differences, errors, without_mean_heading
 
 
-def test_heading_and_inclination_are_what_was_turned() -> None:
+def test_heading_and_inclination_errors_equal_the_rotations() -> None:
     truth = Rotation.random(20, rng=1)
     yaw, tilt = Rotation.from_euler("z", 0.3), Rotation.from_rotvec([0.1, 0.0, 0.0])
     total, heading, inclination = errors(differences((yaw * truth).as_quat(), truth.as_quat()))

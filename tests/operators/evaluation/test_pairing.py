@@ -30,7 +30,7 @@ def test_pairs_are_those_of_the_whole_lists(found: list[int], truth: list[int], 
     assert pairing.unmatched_truths == len(truth) - len(expected)
 
 
-def test_what_is_decided_is_not_kept() -> None:
+def test_pairing_discards_decided_entries() -> None:
     pairing: Pairing[int, int] = Pairing(1)
     for stamp in range(0, 10_000, 10):
         pairing.add_found(stamp, stamp)

@@ -61,7 +61,7 @@ def scored(
     return dict(metrics.summary())
 
 
-def test_a_right_graph_in_a_frame_of_its_own_scores_one() -> None:
+def test_right_graph_in_another_frame_scores_one() -> None:
     figures = scored([(7, "table", TABLE[2], TABLE[3]), (8, "box", BOX[2], BOX[3])], [(8, "on", 7)], offset=3.0)
     assert figures == {
         "graphs": 6,
@@ -74,7 +74,7 @@ def test_a_right_graph_in_a_frame_of_its_own_scores_one() -> None:
     }
 
 
-def test_a_double_and_a_false_relation_count_and_what_was_never_seen_does_not() -> None:
+def test_doubles_and_false_relations_count_and_unseen_objects_do_not() -> None:
     beside = (2.25, 0.0, 0.9)
     nodes: list[Thing] = [
         (7, "table", TABLE[2], TABLE[3]),
@@ -103,6 +103,6 @@ def test_a_robot_in_another_frame_than_its_graph_is_refused() -> None:
         scored([(7, "table", TABLE[2], TABLE[3])], [], frame="map")
 
 
-def test_scores_load_nothing_of_what_a_map_needs() -> None:
+def test_scoring_imports_no_map_dependencies() -> None:
     code = "import sys; from operators.evaluation import SceneGraphMetrics; print('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

@@ -60,5 +60,5 @@ def test_another_frame_an_empty_surface_and_none_at_all_are_named() -> None:
     assert scored([], sheet())["f_score"] == "not computed: no surface came"
 
 
-def test_equal_surfaces_give_equal_figures_though_points_of_them_are_drawn_at_random() -> None:
+def test_surface_metrics_are_deterministic_despite_sampling() -> None:
     assert scored([sheet(0.01, width=3.0)], sheet()) == scored([sheet(0.01, width=3.0)], sheet())

@@ -127,7 +127,7 @@ def test_the_relative_errors_are_evos(seconds: float, metres: float) -> None:
 
 
 @pytest.mark.usefixtures("evo")
-def test_evo_too_refuses_to_align_what_lies_on_a_line() -> None:
+def test_collinear_positions_cannot_be_aligned_as_in_evo() -> None:
     from evo.core.geometry import GeometryException
 
     line = [np.array([float(i), 0.0, 0.0]) for i in range(5)]
@@ -140,7 +140,7 @@ def test_evo_too_refuses_to_align_what_lies_on_a_line() -> None:
 
 
 @pytest.mark.parametrize("scaled", [False, True])
-def test_the_alignment_is_what_was_applied(scaled: bool) -> None:
+def test_alignment_recovers_the_applied_transform(scaled: bool) -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         R, t = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 5, 3)

@@ -121,7 +121,7 @@ def test_without_alignment_an_offset_is_an_error() -> None:
     assert score(moved, path)["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_pose_is_scored_against_the_truth_of_its_own_stamp() -> None:
+def test_pose_is_scored_against_the_truth_of_the_same_stamp() -> None:
     """Truth at 100 Hz and batches that come late: neither the denser nor the delayed truth confuses the pairing."""
     path = circle(1001)
     dense = [truth(T, 0, i * STEP // 10) for i, T in enumerate(path)]
@@ -148,7 +148,7 @@ def test_too_few_poses_or_a_path_without_motion_have_no_aligned_error(count: int
 
 
 @pytest.mark.parametrize("lost", ["unmatched_estimates", "truths_not_finite", "estimates_not_finite"])
-def test_poses_without_a_finite_truth_or_not_finite_are_counted_and_the_others_score(lost: str) -> None:
+def test_non_finite_poses_are_counted_and_the_others_scored(lost: str) -> None:
     path, nowhere = circle(), {"position": [np.nan, 0, 0]}
     estimates, truths = [estimate(T, k) for k, T in enumerate(path)], [[truth(T, k)] for k, T in enumerate(path)]
     for k in (10, 11):

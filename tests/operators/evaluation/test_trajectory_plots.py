@@ -56,7 +56,7 @@ def test_errors_are_those_of_the_poses() -> None:
     assert dict(operator._nis)["gnss/fix"] == [(1.0, 1.0), (2.0, 1.0), (3.0, 4.0), (4.0, 4.0)]
 
 
-def test_a_first_pose_moved_onto_its_truth_leaves_what_changes() -> None:
+def test_origin_alignment_removes_a_constant_offset() -> None:
     made, _ = played(poses(off=0.3), poses(), alignment="origin")
     assert max(n.value for n in made["error"]) < 1e-9
 

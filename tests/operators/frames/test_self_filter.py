@@ -72,7 +72,7 @@ parts = st.builds(
 
 
 @given(parts, st.integers(0, 1000), st.floats(0, 0.2))
-def test_a_box_holds_what_its_own_axes_say(part: BodyPart, seed: int, padding: float) -> None:
+def test_box_contains_points_by_its_axes(part: BodyPart, seed: int, padding: float) -> None:
     rng = np.random.default_rng(seed)
     T = se3.exp(rng.uniform(-1, 1, 6)) @ part.pose()
     own = rng.uniform(-2, 2, (50, 3))

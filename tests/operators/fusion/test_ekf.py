@@ -81,7 +81,7 @@ def test_odometry_without_velocity_counts_by_its_steps() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"use": "doppler", "sigma": 0.03}, {"sigma": 0.03}], ids=["doppler", "auto"])
-def test_radar_gives_the_velocity_and_what_moves_is_refused(settings: dict[str, Any]) -> None:
+def test_radar_measures_velocity_and_moving_detections_are_refused(settings: dict[str, Any]) -> None:
     robot = Robot()
     sensors = {"robot/radar": settings}
     operator, played = fused({"robot/imu": robot.imu, "robot/radar": robot.scans()}, start="origin", sensors=sensors)
@@ -159,7 +159,7 @@ def test_without_inertial_sensor_poses_are_smoothed() -> None:
     assert operator.summary()["robot/pose, refused"] == 0
 
 
-def test_without_inertial_sensor_a_control_input_carries_the_estimate_through_an_outage() -> None:
+def test_control_input_bridges_an_outage_without_inertial_sensor() -> None:
     """A body on a circle at 1 m/s and 0.5 rad/s, whose positions end after 3 s."""
     stamps = [100_000_000 * k for k in range(1, 61)]
     circle = [transform(stamp * 1e-9) for stamp in stamps]
@@ -195,7 +195,7 @@ def transform(t: float) -> Array:
     return T
 
 
-def test_what_is_ignored_is_counted_with_its_reason() -> None:
+def test_ignored_measurements_are_counted_by_reason() -> None:
     robot = Robot(3.0)
     fixes = robot.fixes()
     stamp = fixes[-1].stamp
@@ -218,7 +218,7 @@ def test_what_is_ignored_is_counted_with_its_reason() -> None:
     assert "robot/fix" in status.names
 
 
-def test_fixes_without_altitude_count_horizontally_and_the_status_names_what_is_missing() -> None:
+def test_fixes_without_altitude_correct_horizontally_and_are_reported() -> None:
     robot = Robot(10.0)
     operator, played = fused({"robot/imu": robot.imu, "robot/fix": robot.fixes(altitude=False)}, **HEADING)
     made: list[Any] = list(played["odometry"])

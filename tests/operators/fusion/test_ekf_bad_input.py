@@ -77,7 +77,7 @@ def test_a_message_that_cannot_be_used_is_counted(message: Message, reason: str)
     np.testing.assert_array_equal(after.covariance, before.covariance)
 
 
-def test_detections_and_landmarks_that_cannot_be_used_are_counted_and_the_others_serve() -> None:
+def test_unusable_detections_and_landmarks_are_counted_and_others_used() -> None:
     operator = begun(ranges={"sigma": 0.1})
     stamp = 19 * 10**8
     scan = RadarScan(stamp=stamp, frame="radar", ranges=[5.0] * 3, azimuths=[0.0, 0.1, NAN], velocities=[0.0, NAN, 0.0])
@@ -106,7 +106,7 @@ def test_messages_that_do_not_come_after_the_last_are_counted_and_not_used_twice
     assert sum(int(figures[f"robot/x, {fate}"]) for fate in ("used", "refused", "unconfirmed")) == 1
 
 
-def test_an_inertial_sample_without_covariance_is_as_good_as_the_last_and_the_first_must_have_one() -> None:
+def test_inertial_sample_without_covariance_takes_the_last_one() -> None:
     operator = begun()
     imu = Robot(1.2).imu[52]
     for k, C in enumerate((None, np.zeros((3, 3)), np.full((3, 3), NAN))):
@@ -120,7 +120,7 @@ def test_an_inertial_sample_without_covariance_is_as_good_as_the_last_and_the_fi
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_whatever_a_pose_holds_the_estimate_stays_finite(data: st.DataObject) -> None:
+def test_estimate_stays_finite_for_arbitrary_poses(data: st.DataObject) -> None:
     number = st.floats(allow_nan=True, allow_infinity=True, width=32)
     position = data.draw(st.lists(number, min_size=3, max_size=3))
     covariance = np.array(data.draw(st.lists(number, min_size=36, max_size=36))).reshape(6, 6)

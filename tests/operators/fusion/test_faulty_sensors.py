@@ -178,7 +178,7 @@ def test_fixes_later_than_the_window_are_counted_and_a_warning_names_them() -> N
     assert "robot/fix" not in Run(drive, drive.fixes(late=0.5)).alarms
 
 
-def test_what_was_measured_before_the_filter_began_is_not_too_late() -> None:
+def test_measurements_before_the_filter_start_are_not_late() -> None:
     drive = Drive(2.0)
     run = Run(drive, drive.fixes(late=0.3))
     assert run.operator.summary()["ignored, robot/fix: before the beginning"] == 3
@@ -193,7 +193,7 @@ def test_room_that_the_filter_makes_is_a_warning_with_the_name_of_the_sensor() -
 
 
 @pytest.mark.parametrize("wheels", [pytest.param(True, marks=pytest.mark.long), False])
-def test_positions_that_jump_are_named_and_not_followed_since_the_inertial_sensor_felt_nothing(wheels: bool) -> None:
+def test_position_jumps_without_inertial_evidence_are_rejected_and_named(wheels: bool) -> None:
     drive = Drive(13.0)
     run = Run(drive, drive.fixes(jump=(6.0, 11.0)), *([drive.wheels(1.0)] if wheels else []))
     assert 6.0 <= run.alarms["robot/fix"][0][0] <= 7.0
@@ -205,7 +205,7 @@ def test_positions_that_jump_are_named_and_not_followed_since_the_inertial_senso
 
 @pytest.mark.long
 @pytest.mark.parametrize("wheels", [True, False])
-def test_positions_that_repeat_while_the_robot_drives_on_are_frozen_and_used_again_when_they_move(wheels: bool) -> None:
+def test_repeated_positions_in_motion_are_frozen_until_they_change(wheels: bool) -> None:
     drive = Drive(11.0)
     run = Run(drive, drive.fixes(frozen=(6.0, 9.0)), *([drive.wheels(1.0)] if wheels else []))
     first, text = run.alarms["robot/fix"][0]
@@ -393,7 +393,7 @@ ABSORBED = pytest.mark.xfail(
 
 @pytest.mark.long
 @pytest.mark.parametrize("wrong", [0.5, pytest.param(-0.5, marks=ABSORBED), 1.0, -2.0, 3.1])
-def test_a_wrong_first_heading_is_warned_of_within_a_second_and_as_long_as_it_is_wrong(wrong: float) -> None:
+def test_wrong_initial_heading_is_warned_of_while_it_is_wrong(wrong: float) -> None:
     """A second from the third position, the first that shows an acceleration: poses begin with the second."""
     told = []
     for seed in range(3):

@@ -94,7 +94,7 @@ def test_dropped_samples_are_bridged() -> None:
     assert np.degrees(made.errors(played)[0][200:].max()) < 4
 
 
-def test_a_long_gap_begins_anew_and_is_counted() -> None:
+def test_long_gap_restarts_the_filter_and_is_counted() -> None:
     made = Turns()
     operator = OrientationFilter(heading="relative")
     samples = made.imu()
@@ -103,7 +103,7 @@ def test_a_long_gap_begins_anew_and_is_counted() -> None:
     assert len(played["oriented"]) == len(samples) - 100 - 2 * 15
 
 
-def test_what_is_not_finite_is_counted_and_survived() -> None:
+def test_non_finite_input_is_ignored_and_counted() -> None:
     made = Turns(4.0)
     samples, fields = made.imu(), made.fields()
     samples[150] = Imu(
@@ -131,7 +131,7 @@ def test_restored_operator_resumes_alike() -> None:
 
 
 @pytest.mark.data
-def test_broad_is_as_good_as_its_paper_says(data_dir: Path) -> None:
+def test_error_on_broad_is_within_that_of_its_paper(data_dir: Path) -> None:
     trial = read_trial(data_dir / "broad_imu" / "16_undisturbed_fast_translation_B.hdf5")
     filter = Orientation(1 / trial.rate)
     scored, found = trial.movement & np.isfinite(trial.orientations).all(axis=1), []

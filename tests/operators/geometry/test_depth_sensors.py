@@ -55,7 +55,7 @@ def test_an_unknown_sensor_is_an_error_that_lists_the_known(kind: type) -> None:
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_cameras_take_the_noise_of_their_sensor_and_what_is_given_beside_it_wins(kind: type) -> None:
+def test_depth_noise_follows_the_sensor_unless_given(kind: type) -> None:
     def noise(**params: object) -> DepthNoise:
         operator = kind(**params)
         operator.setup()
@@ -69,7 +69,7 @@ def test_cameras_take_the_noise_of_their_sensor_and_what_is_given_beside_it_wins
 
 
 @pytest.mark.parametrize(("name", "range_noise"), [("", MapSettings().range_noise), ("kinect_v1", 0.001425)])
-def test_the_map_takes_what_noise_grows_by(name: str, range_noise: float) -> None:
+def test_map_takes_the_range_noise_of_the_sensor(name: str, range_noise: float) -> None:
     operator = SemanticMap(depth_sensor=name)
     operator.setup()
     operator.state = operator.initial_state()

@@ -32,7 +32,7 @@ def reason(tree: FrameTree, frame: str, child: str, stamp: int) -> str:
 
 
 @given(st.lists(twists, min_size=5, max_size=5), st.permutations(range(6)), st.integers(0, 5), st.integers(0, 5))
-def test_a_lookup_is_the_product_of_what_lies_between(
+def test_lookup_is_the_product_of_the_transforms_between(
     steps: list[np.ndarray], order: list[int], a: int, b: int
 ) -> None:
     parents = [0, 0, 1, 1, 3]  # frame k + 1 is in frame parents[k]: a tree with two branches

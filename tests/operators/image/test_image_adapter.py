@@ -83,7 +83,7 @@ def test_dark_and_noisy_images_are_not_made_brighter_than_their_noise_allows() -
 
 
 @given(st.floats(0.0, 40.0), st.floats(0.0, 255.0), st.floats(0.0, 0.5))
-def test_what_is_done_begins_at_nothing_and_has_no_jumps(noise: float, brightness: float, step: float) -> None:
+def test_adaptation_is_continuous_and_bounded(noise: float, brightness: float, step: float) -> None:
     adaptation, here = Adaptation(), Measured(noise, brightness)
     assert 1 <= adaptation.gain(here) <= adaptation.most_gain
     assert adaptation.gain(here) * noise <= max(adaptation.most_noise, noise) + 1e-9
@@ -115,7 +115,7 @@ def test_an_image_is_adapted_alike_whatever_came_before() -> None:
     assert [m.digest() for m in alone] == [m.digest() for m in after]
 
 
-def test_the_status_says_what_was_measured_and_done() -> None:
+def test_status_reports_measurements_and_corrections() -> None:
     played = adapted(noisy(scene(25), 1.0), noisy(scene(), 12.0))
     first, second = (s for s in played["status"] if isinstance(s, Diagnostics))
     assert "times as long" in first.messages[0]
@@ -123,7 +123,7 @@ def test_the_status_says_what_was_measured_and_done() -> None:
     assert second.pairs(0) == {"images": "2", "made brighter": "1", "noise removed": "1"}
 
 
-def test_a_restored_adapter_goes_on_counting() -> None:
+def test_restored_adapter_continues_counting() -> None:
     first, second = ImageAdapter(), ImageAdapter()
     first.setup()
     second.setup()

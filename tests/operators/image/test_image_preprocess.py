@@ -90,7 +90,7 @@ def test_the_fisheye_is_that_of_its_paper() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_an_undistorted_image_shows_what_its_calibration_says(lens: str) -> None:
+def test_undistorted_image_matches_its_calibration(lens: str) -> None:
     raw = camera(**LENSES[lens])
     image, info, counts = outcome(prepared(raw_image(raw), raw))
     assert (info.distortion, info.distortion_model, info.frame) == (None, "none", "camera")
@@ -159,7 +159,7 @@ def test_coefficients_stay_where_the_lens_is_kept() -> None:
     np.testing.assert_allclose(undistorted(np.array([[20.0, 30]]), info), undistorted(np.array([[28.0, 34]]), raw))
 
 
-def test_what_needs_nothing_passes_bit_for_bit() -> None:
+def test_image_without_preprocessing_passes_bit_for_bit() -> None:
     color = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     for lens in ("keep", "undistort"):
         image, info, _ = outcome(prepared(color, camera(), lens=lens))
@@ -209,7 +209,7 @@ def test_hue_stays_where_brightness_changes() -> None:
         (camera(distortion_model="equidistant", K=np.diag([40.0, 40, 1]), distortion=np.zeros(4)), {}, "no ray before"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_done_is_named(info: CameraInfo, params: dict[str, Any], text: str) -> None:
+def test_impossible_preprocessing_is_refused(info: CameraInfo, params: dict[str, Any], text: str) -> None:
     with pytest.raises(OperatorFailure, match=text):
         prepared(np.zeros((HEIGHT, WIDTH), np.uint8), info, **params)
 

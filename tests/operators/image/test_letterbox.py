@@ -13,7 +13,7 @@ EXTENT = st.integers(8, 400)
 
 @settings(max_examples=60, deadline=None)
 @given(st.tuples(EXTENT, EXTENT), st.tuples(EXTENT, EXTENT), st.sampled_from(["stretch", "letterbox"]))
-def test_the_image_as_a_box_comes_back_whole(image, target, mode) -> None:
+def test_letterbox_restores_the_box_of_the_whole_image(image, target, mode) -> None:
     fit = ImageFit.plan(mode, image, target)
     (x, y), (width, height) = fit.offset, fit.inner
     assert min(x, y) >= 0

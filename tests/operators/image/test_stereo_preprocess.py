@@ -93,7 +93,7 @@ motions = st.tuples(
 
 
 @given(motions, st.integers(0, 100))
-def test_points_lie_in_one_row_and_their_disparity_tells_their_depth(motion: tuple[float, ...], seed: int) -> None:
+def test_rectified_points_share_a_row_and_disparity_gives_depth(motion: tuple[float, ...], seed: int) -> None:
     T = se3.exp(np.array([motion[0], motion[1] * motion[0], motion[2] * motion[0], *motion[3:]]))
     ideal = [info.replace(distortion=None, distortion_model="none") for info in infos()]
     found = rectify(ideal[0], ideal[1], T, 1.0)

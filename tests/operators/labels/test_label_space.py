@@ -83,7 +83,7 @@ def test_a_class_without_an_entry_has_no_roles_and_no_size(tmp_path: Path) -> No
     ],
     ids=["role", "no unit", "unit", "two spreads", "negative", "key", "alias twice", "class twice", "list", "no YAML"],
 )
-def test_error_in_a_file_names_its_place_and_what_would_be_right(tmp_path: Path, text: str, told: str) -> None:
+def test_error_in_a_file_names_its_place_and_a_remedy(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(LabelSpaceError, match="(?s)" + told):
         space(tmp_path, text)
 

@@ -80,7 +80,7 @@ def test_a_run_that_was_interrupted_ends_with_the_same_bits(tmp_path: Path, epoc
     assert [row["epoch"] for row in outcome.history] == [1, 2, 3, 4, 5, 6]
 
 
-def test_what_is_trained_on_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+def test_training_is_independent_of_the_number_of_workers(tmp_path: Path) -> None:
     one, many = Line(), Line()
     train(one, settings(), tmp_path / "one.onnx")
     train(many, settings(workers=4), tmp_path / "many.onnx")

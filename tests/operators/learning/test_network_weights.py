@@ -41,7 +41,7 @@ def scene(folder: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.long
-def test_a_training_begins_with_what_the_file_answers(trained: Path, worlds: Path) -> None:
+def test_training_starts_with_the_outputs_of_the_file(trained: Path, worlds: Path) -> None:
     task = pair(worlds)
     task.begin_with(trained / "detector.onnx")
 
@@ -60,7 +60,7 @@ def test_networks_of_rendered_worlds_are_marked_as_trained_in_simulation(trained
 
 
 @pytest.mark.long
-def test_normalisation_while_training_agrees_with_what_was_measured(trained: Path, worlds: Path) -> None:
+def test_normalisation_in_training_agrees_with_the_stored_statistics(trained: Path, worlds: Path) -> None:
     task = pair(worlds)
     task.begin_with(trained / "detector.onnx")
     images = sample_images(task)
@@ -115,7 +115,7 @@ def test_anchors_grow_with_the_input(trained: Path, worlds: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_file_that_does_not_fit_is_refused_with_what_differs(trained: Path, worlds: Path) -> None:
+def test_mismatched_weights_file_is_refused_with_the_difference(trained: Path, worlds: Path) -> None:
     with pytest.raises(
         TrainingFileError, match=r"its architecture is 'smallresnet-0[.]25 fpn grid', and this one's 'sm"
     ):

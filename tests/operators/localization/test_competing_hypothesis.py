@@ -51,7 +51,7 @@ def off(drive: Drive, played: Played) -> list[float]:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
-def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_are_named(seed: int) -> None:
+def test_symmetric_hall_is_ambiguous_and_both_places_are_named(seed: int) -> None:
     drive = HallDrive(5.0, seed=seed)
     played, operator = localized(drive, {"scan": drive.scans()})
     assert not played["pose"]
@@ -65,7 +65,7 @@ def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
-def test_what_makes_the_ends_differ_decides(seed: int) -> None:
+def test_asymmetry_resolves_the_ambiguous_hall(seed: int) -> None:
     drive = HallDrive(5.0, notch=True, seed=seed)
     played, _ = localized(drive, {"scan": drive.scans()})
     assert len(played["pose"]) > 50
@@ -83,7 +83,7 @@ def test_a_known_start_or_a_position_decides() -> None:
         assert max(off(drive, played)) < 0.2
 
 
-def test_what_is_followed_comes_back_from_a_snapshot() -> None:
+def test_competing_hypothesis_is_restored_from_a_snapshot() -> None:
     drive = HallDrive(2.0)
     _, operator = localized(drive, {"scan": drive.scans()})
     rival = operator.state.fused.competing

@@ -178,7 +178,7 @@ def test_the_number_of_particles_follows_the_spread() -> None:
     assert played["particles"][-1].count < 250
 
 
-def test_what_cannot_be_used_is_counted_with_its_reason() -> None:
+def test_unusable_measurements_are_counted_by_reason() -> None:
     drive = Drive(1.0)
     empty = PointCloud(stamp=100_000_000, frame="base_link", points=np.full((20, 3), np.nan))
     strange = LandmarkSightings(
@@ -239,7 +239,7 @@ def test_an_object_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: 
     assert digests[0] == digests[1]
 
 
-def test_odometry_and_rates_that_are_not_finite_or_late_are_counted_and_the_robot_is_followed() -> None:
+def test_non_finite_or_late_odometry_is_counted_and_localization_continues() -> None:
     drive = Drive(4.0)
     odometry: list[Any] = drive.odometry()
     for k in (30, 31, 50):

@@ -29,7 +29,7 @@ def write(folder: Path, *lines: str, origin: str = "[0, 0, 0]", pixels: np.ndarr
         ("mode: raw", [0, 100, -1, -1]),
     ],
 )
-def test_the_mode_says_what_a_pixel_means(tmp_path: Path, mode: str, cells: list[int]) -> None:
+def test_mode_decides_the_meaning_of_a_pixel(tmp_path: Path, mode: str, cells: list[int]) -> None:
     assert read_map(write(tmp_path, mode), "map").cells.tolist() == [cells]
 
 

@@ -72,7 +72,7 @@ def test_a_table_stays_taken_though_it_is_seen_over_and_under() -> None:
     assert 0 <= cell(grid, 0.6, 0.02) < 50
 
 
-def test_what_went_away_becomes_free() -> None:
+def test_cells_of_a_removed_object_become_free() -> None:
     post = np.column_stack([np.full(8, 1.02), np.zeros(8), 1.02 * np.tan(np.linspace(-0.25, 0.25, 8))])
     clouds = [cloud(np.concatenate([post, walls()])), *(cloud(walls(), k) for k in range(2, 15))]
     played = mapped(clouds, [pose(stamp=k) for k in range(1, 15)])
@@ -127,7 +127,7 @@ def test_a_table_top_that_few_scans_hit_at_its_edge_stays_though_all_pass_below_
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((5, 3), np.nan), np.zeros((9, 3))])
-def test_a_cloud_that_tells_nothing_is_named_and_survived(points: np.ndarray) -> None:
+def test_uninformative_cloud_is_reported_and_survived(points: np.ndarray) -> None:
     played = mapped([cloud(points), cloud(walls(), 2)], [pose(), pose(stamp=2)])
     first, second = played["status"]
     assert first.levels.tolist() == [1]

@@ -80,7 +80,7 @@ def joined(rooms: Rooms) -> dict[tuple[int, int], tuple[float, float, float]]:
     return {pair: (place[0], place[1], place[2]) for pair, place in zip(pairs, places, strict=True)}
 
 
-def test_rooms_are_parted_at_doors_whose_places_and_widths_are_told() -> None:
+def test_rooms_are_split_at_doors_with_position_and_width() -> None:
     rooms = only(flat())
     left, right, hall = at(rooms, 2.5, 4), at(rooms, 7, 4), at(rooms, 5, 1.3)
     assert sorted((left, right, hall)) == rooms.ids.tolist() == [1, 2, 3]
@@ -122,7 +122,7 @@ def test_two_doors_between_the_same_rooms_are_two() -> None:
     np.testing.assert_allclose(np.sort(rooms.door_positions[:, 1]), [2.9, 5.25], atol=0.06)
 
 
-def test_what_stands_free_is_no_wall() -> None:
+def test_free_standing_objects_are_no_walls() -> None:
     """Chairs in the middle leave passages as narrow as doors."""
     plan = FloorPlan(4.5, 6.5).rooms((0.5, 0.5, 3.5, 6.0))
     for x in (0.9, 1.8, 2.7):
@@ -150,7 +150,7 @@ def test_rooms_keep_their_ids_while_the_map_grows() -> None:
     assert {at(after, 2.5, 4), at(after, 5, 1.3)} == {2, 3}
 
 
-def test_rooms_that_prove_to_be_one_keep_the_id_of_the_larger_and_the_other_is_given_no_more() -> None:
+def test_merged_rooms_keep_the_id_of_the_larger_and_retire_the_other() -> None:
     one = FloorPlan(9.5, 6.5).rooms((0.5, 0.7, 9.0, 6.0))
     before, after, again = segmented([flat().at(0), one.at(3), flat().at(6)])
     assert after.ids.tolist() == [at(before, 7, 4)]
@@ -190,7 +190,7 @@ def test_restored_operator_resumes_alike() -> None:
 
 
 @pytest.mark.parametrize("clear", [0.7, 0.83, 1.0])
-def test_the_width_of_a_door_is_that_between_its_jambs_wherever_they_lie_in_their_cells(clear: float) -> None:
+def test_door_width_is_unbiased_by_the_grid(clear: float) -> None:
     """A cell is taken where a jamb lies in it: in the mean over places the width is neither too small nor too large."""
     widths = []
     for start in np.arange(1.5, 1.5 + SIDE, SIDE / 10):

@@ -76,7 +76,7 @@ def test_noise_is_averaged() -> None:
     assert np.sqrt(np.square(off).mean()) < 0.008
 
 
-def test_what_has_gone_is_carved_away() -> None:
+def test_removed_object_is_carved_away() -> None:
     empty = np.full((60, 80), 2.5, np.float32)
     depths = [depth(sphere()), *(depth(empty, k) for k in range(2, 14))]
     outputs = mapped(depths, [pose(stamp=k) for k in range(1, 14)])
@@ -112,7 +112,7 @@ def test_a_pose_that_is_not_finite_is_named_and_left_out() -> None:
     assert len(last_mesh(outputs).vertices) == 0
 
 
-def test_what_does_not_fit_is_an_error() -> None:
+def test_mismatched_input_is_an_error() -> None:
     operator = TsdfMap(most_blocks=3)
     operator.setup()
     with pytest.raises(ValueError, match="depth has 10x10 pixels"):

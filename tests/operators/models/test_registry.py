@@ -105,7 +105,7 @@ def test_a_file_is_known_by_its_digest_whatever_its_name() -> None:
     assert registry.with_digest("1" * 64) is None
 
 
-def test_a_part_is_a_row_with_a_file_of_its_own() -> None:
+def test_part_of_a_model_is_a_row_with_its_file() -> None:
     registry = Registry.load()
     model = registry["clip_vit_b32"]
     text = registry["clip_vit_b32.text"]

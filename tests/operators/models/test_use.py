@@ -122,7 +122,7 @@ def test_a_row_with_a_parameter_that_is_not_taken_from_it_is_refused(registered:
     ],
 )
 @pytest.mark.parametrize("model", ["simulated", str(shipped("detector.onnx"))])
-def test_a_network_of_our_training_refuses_what_its_file_holds(params: dict[str, Any], named: str, model: str) -> None:
+def test_trained_network_refuses_parameters_its_file_holds(params: dict[str, Any], named: str, model: str) -> None:
     with pytest.raises(ModelError, match=rf"leave {named} of OnnxDetector out"):
         OnnxDetector(model=model, **params).setup()
 

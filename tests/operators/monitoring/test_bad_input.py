@@ -94,7 +94,7 @@ def test_scans_with_a_velocity_that_is_not_finite_are_counted_and_raise_no_alarm
     assert played["status"][-1].pairs(0)["with few common surfaces"] == str(len(BAD))
 
 
-def test_calibrations_of_another_size_and_frames_that_no_transform_relates_are_named() -> None:
+def test_mismatched_calibrations_and_unrelated_frames_are_named() -> None:
     depths, images, clouds = room()
     small = [d.replace(data=d.data[:120, :160]) for d in depths]
     masts, high = [i.replace(frame="mast") for i in images], [c.replace(frame="mast") for c in clouds]

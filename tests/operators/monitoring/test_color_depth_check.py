@@ -72,7 +72,7 @@ def test_rims_are_pixels_in_front_of_something() -> None:
     assert set(rims(depth, K)[:, 2]) == {1.0}
 
 
-def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_check_continues_identically() -> None:
     given = (info("color"), info("depth"), extrinsics(color=("y", 3.0)))
     calls = [(image, depth, *given) for image, depth in zip(*pairs(), strict=True)]
     assert_repeats(ColorDepthCheck, calls[:8:2], 3)
@@ -100,7 +100,7 @@ def figures(pattern: str, text: str) -> list[float]:
     return [float(each) for each in told.groups()]
 
 
-def test_a_displaced_or_turned_camera_is_found_with_what_puts_it_right_where_it_is_sure() -> None:
+def test_displaced_or_rotated_camera_is_reported_with_the_correction() -> None:
     text, given = finding(ColorDepthCheck(period="200ms"), displaced(-0.08))
     assert figures(r"with the colour camera (\S+) cm to the right and (\S+) cm down", text) == pytest.approx(
         [8, 0], abs=2

@@ -51,7 +51,7 @@ def test_turned_sensor_is_reported_within_seconds(sensor: str, axis: str) -> Non
     assert "turned by" in said[-1]
 
 
-def test_the_misfit_is_what_makes_scans_lie_on_the_depth() -> None:
+def test_misfit_aligns_scans_with_the_depth() -> None:
     agreement = DepthScanAgreement()
     wrong = exp(np.array([0.0, 0.0, 0.0, 0.02, -0.03, 0.01]))
     for cloud, depth in zip(*pairs(1.03), strict=True):
@@ -82,6 +82,6 @@ def test_scans_with_times_are_deskewed_by_the_velocity_or_left_out() -> None:
     assert untold["status"][-1].pairs(0)["without a velocity"] == "14"
 
 
-def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_check_continues_identically() -> None:
     calls = [(cloud, depth, info("depth"), extrinsics()) for cloud, depth in zip(*pairs(1.05), strict=True)]
     assert_repeats(DepthScanCheck, calls[:7], 6)

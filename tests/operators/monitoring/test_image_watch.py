@@ -24,7 +24,7 @@ def test_new_images_pass_as_they_are() -> None:
     assert [m.digest() for m in played["checked"]] == [m.digest() for m in given]
 
 
-def test_images_that_repeat_the_last_one_or_are_black_are_held_back_until_they_change() -> None:
+def test_repeated_or_black_images_are_held_back() -> None:
     played = play(ImageWatch(), {"image": images(50, 50, 50, 60, 0, 70)})
     assert [m.stamp for m in played["checked"]] == [0, 3, 5]
     said = [status.messages[0] for status in played["status"]]
@@ -42,7 +42,7 @@ def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
     assert [m.stamp for m in played["checked"]] == [0, 2]
 
 
-def test_watches_repeat_and_a_restored_one_knows_the_last_image() -> None:
+def test_restored_watch_repeats_with_its_last_image() -> None:
     first, second = assert_repeats(ImageWatch, [(each,) for each in images(50, 50)], 1)
     assert "checked" in first
     assert "checked" not in second

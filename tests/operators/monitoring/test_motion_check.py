@@ -129,7 +129,7 @@ def test_wheels_at_rest_on_a_moving_robot_are_held_back_at_once_and_only_then() 
 
 
 @pytest.mark.parametrize("sensor", [pytest.param("wheels", marks=pytest.mark.long), "imu"])
-def test_sensor_that_repeats_a_reading_of_motion_is_reported_and_one_at_rest_is_not(sensor: str) -> None:
+def test_sensor_repeating_a_reading_is_reported_only_in_motion(sensor: str) -> None:
     given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
     held = next(m for m in given if m.stamp >= 6_000_000_000)
     hung = [held.replace(stamp=m.stamp) if 6 <= m.stamp * 1e-9 < 7.5 else m for m in given]
@@ -177,7 +177,7 @@ def test_of_two_it_is_open_which_is_wrong_and_wheels_still_pass() -> None:
     assert len(played["checked"]) == len(wheels())
 
 
-def test_checks_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_check_continues_identically() -> None:
     by_stamp: dict[int, dict[str, Odometry]] = {}
     for name, messages in (
         ("wheels", wheels(1.05)), ("camera", odometry("camera", 10, 1)), ("lidar", odometry("lidar", 20, 2)),

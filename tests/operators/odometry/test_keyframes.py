@@ -36,13 +36,11 @@ def test_views_differ_by_baseline_over_depth_and_by_angle() -> None:
     ],
     ids=["two near each other", "in a row", "of equal ones the first but one", "not among the newest", "no other"],
 )
-def test_the_keyframe_whose_neighbours_see_nearly_what_it_sees_makes_room(
-    places: list[float], recent: int, expected: int
-) -> None:
+def test_most_redundant_keyframe_is_dropped(places: list[float], recent: int, expected: int) -> None:
     assert redundant([at(x) for x in places], recent) == expected
 
 
-def test_a_new_map_is_looked_for_at_every_frame_for_a_second_and_at_every_third_then() -> None:
+def test_recall_runs_at_every_frame_for_a_second_and_then_periodically() -> None:
     assert all(recall_due(7 * SECOND + k, 7 * SECOND, recalls) for k in (0, SECOND - 1) for recalls in range(3))
     later = [recall_due(8 * SECOND, 7 * SECOND, recalls) for recalls in range(2 * RECALL_EVERY)]
     assert later == [k % RECALL_EVERY == 0 for k in range(2 * RECALL_EVERY)]

@@ -32,7 +32,7 @@ def test_a_steady_motion_is_predicted_to_go_on() -> None:
     np.testing.assert_allclose(motion.predict(3 * TENTH, DECAY), se3.exp(0.3 * TWIST), atol=1e-12)
 
 
-def test_a_blind_motion_dies_out_alike_however_frames_divide_the_time() -> None:
+def test_blind_motion_decays_independently_of_the_frame_rate() -> None:
     ways = [blind(steady(AHEAD), *frames).T_world_camera[0, 3] for frames in [(2, 3, 4, 5, 6), (2, 6), (2, 4, 6)]]
     assert ways == pytest.approx([ways[0]] * 3)
     before = blind(steady(AHEAD), 2, 6)
@@ -40,7 +40,7 @@ def test_a_blind_motion_dies_out_alike_however_frames_divide_the_time() -> None:
     assert 0.16 + 0.8 * 0.05 < ways[0] < later < 0.16 + 0.8 * DECAY
 
 
-def test_the_spread_of_a_prediction_is_that_of_the_acceleration_over_the_whole_blind_time() -> None:
+def test_prediction_spread_grows_with_the_blind_time_squared() -> None:
     motion, sum_ = steady(TWIST), np.zeros(6)
     for k in (2, 3, 5, 8):
         sum_ += np.sqrt(np.diag(motion.spread(k * TENTH, 3.0, 7.0)))

@@ -38,7 +38,7 @@ def test_descriptors_pair_with_those_that_they_were() -> None:
     assert sorted(pairs_of(known, seen)) == [[0, 1], [1, 3], [3, 0], [5, 2]]
 
 
-def test_what_looks_like_two_things_is_paired_with_neither_and_each_thing_once() -> None:
+def test_ambiguous_descriptors_are_unmatched_and_matches_are_unique() -> None:
     known = drawn(4)
     later, twice = near(known, 9), np.concatenate([known, near(known[:1], 2)])
     assert match(described(later), described(twice)).tolist() == [[1, 1], [2, 2], [3, 3]]
@@ -48,7 +48,7 @@ def test_what_looks_like_two_things_is_paired_with_neither_and_each_thing_once()
     assert sorted(pairs_of(again, known)) == [[4, 0], [5, 1], [6, 2], [7, 3]]
 
 
-def test_what_is_of_another_size_is_no_rival_and_no_pair() -> None:
+def test_keypoints_of_another_size_are_neither_rivals_nor_pairs() -> None:
     known = drawn(4)
     twice = np.concatenate([known, near(known, 2)])
     sizes = np.array([1.0, 1.5, 0.5, 2.0] + [9.0] * 4)

@@ -124,7 +124,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
 
 
 @pytest.mark.long
-def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
+def test_missing_sensor_disables_only_its_dependents(room: Room) -> None:
     with room.system(("image", "depth", "imu", "wheels")) as system:
         for stamp, step in room.given("image", "depth", "imu", "wheels"):
             whole = system.process(stamp, **step)
@@ -170,7 +170,7 @@ CHOICES = {
 @pytest.mark.parametrize(
     "chosen", [pytest.param(n, marks=() if n == "imu wheels" else pytest.mark.long) for n in CHOICES]
 )
-def test_it_takes_what_is_there(room: Room, chosen: str) -> None:
+def test_system_runs_with_any_subset_of_sensors(room: Room, chosen: str) -> None:
     sensors, (there, gone), made = tuple(chosen.split()), CHOICES[chosen], set[str]()
     with room.system(sensors) as system:
         assert gone <= system.left_out.keys()
@@ -192,7 +192,7 @@ def test_no_detection_of_a_detector_of_ones_own_is_lost(room: Room) -> None:
     assert set(result.tracks.labels()) == {"book"}
 
 
-def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None:
+def test_mismatched_input_is_refused_and_the_system_continues(room: Room) -> None:
     (first, given), (second, following) = list(room.given("image", "depth"))[:2]
     image, depth = given["image"].data, given["depth"].data
     wrong: list[tuple[type[Exception], str, int, dict[str, Any]]] = [
@@ -227,7 +227,7 @@ def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None
     ],
     ids=["none", "unknown", "depth_info", "image_info", "extrinsics", "fusion"],
 )
-def test_what_is_missing_is_named(
+def test_missing_or_unknown_settings_are_named(
     room: Room, sensors: tuple[str, ...] | None, options: dict[str, Any], fault: str
 ) -> None:
     real: dict[str, Message] = {"image_info": room.image_info, "extrinsics": room.extrinsics}

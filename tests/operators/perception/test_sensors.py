@@ -11,7 +11,7 @@ from operators.perception.sensors import HandedSensors
 GRAPH = "graph: handed\noperators: {sensors: {use: 'operators.perception.sensors:HandedSensors'}}\n"
 
 
-def test_it_stands_for_a_device_whose_calibrations_are_static() -> None:
+def test_handed_sensors_have_static_calibrations() -> None:
     graph = load_text(GRAPH)
     node = graph.nodes["sensors"]
     assert node.source

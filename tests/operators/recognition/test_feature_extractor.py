@@ -46,7 +46,7 @@ def test_the_model_is_named_by_its_file_so_that_vectors_of_two_are_not_compared(
     assert found.vectors.shape == (1, 256)
 
 
-def test_an_image_without_detections_of_its_own_has_no_vectors_and_is_counted(classifier: Path) -> None:
+def test_image_without_detections_has_no_vectors_and_is_counted(classifier: Path) -> None:
     shown, boxes = scene()
     operator = FeatureExtractor(weights=str(classifier), per="object")
     (found,) = play(operator, {"image": [shown.replace(stamp=5)], "detections": [boxes]})["features"]
@@ -69,9 +69,7 @@ def test_a_network_of_torchvision_describes_without_its_head(tmp_path: Path) -> 
     np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=1), 1.0, rtol=1e-5)
 
 
-def test_an_embedding_by_name_describes_what_text_describes_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_named_embedding_describes_images_and_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_MODELS", str(write_row(tmp_path)))
     monkeypatch.setenv("DATAFLOW_MODEL_CACHE", str(tmp_path / "cache"))
     shown = image(

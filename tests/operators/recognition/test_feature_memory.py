@@ -36,13 +36,13 @@ def test_the_mean_direction_is_over_all_views_and_given_when_one_is_new() -> Non
     assert third[4][1] == pytest.approx(2 / 5**0.5, abs=1e-4)
 
 
-def test_vectors_of_another_model_begin_anew_and_old_ones_are_forgotten() -> None:
+def test_memory_resets_on_another_model_and_forgets_old_vectors() -> None:
     assert given(vectors(1, {4: (1, 0)}), vectors(2, {4: (0, 1)}, "other"))[1] == {4: [0, 1]}
     answers = given(*(vectors(k, {i: (1, 0)}) for k, i in enumerate((1, 2, 1, 3))), vectors(9, {2: (0, 1)}), most=2)
     assert answers[-1] == {2: [0, 1]}, "2 was described before 1 and 3, so it is begun anew"
 
 
-def test_means_repeat_and_a_restored_memory_goes_on() -> None:
+def test_restored_feature_memory_continues_identically() -> None:
     assert_repeats(FeatureMemory, [(vectors(1, {4: (1, 0)}),), (vectors(2, {4: (0, 1)}),)], 1)
 
 

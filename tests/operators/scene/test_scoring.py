@@ -58,7 +58,7 @@ def test_relations_with_a_node_of_nothing_are_false() -> None:
     assert f1(mine, {11, 12}) == pytest.approx(0.8)
 
 
-def test_precision_and_recall_of_relations_count_what_is_false_and_what_is_missed() -> None:
+def test_relation_precision_and_recall_count_false_and_missed_ones() -> None:
     nodes = {21: ("mug", 1.0), 22: ("table", 2.0), 24: ("mug", 9.0)}
     mine = graph(nodes, [(22, "on", FLOOR), (24, "near", 22), (24, "left_of", 22)])  # one right, two false, one missed
     score, relations = score_nodes(mine, TRUTH, {11, 12}), RelationScore()
@@ -71,7 +71,7 @@ def test_precision_and_recall_of_relations_count_what_is_false_and_what_is_misse
     assert np.isnan(RelationScore().recall("all"))
 
 
-def test_what_is_mapped_scores_by_itself() -> None:
+def test_mapped_relations_are_scored_separately() -> None:
     mine = graph({21: ("mug", 1.0), 23: ("ball", 3.0)}, [(21, "near", 23)])
     relations = RelationScore()
     relations.add(mine, TRUTH, score_nodes(mine, TRUTH, {11}).match, {11})
@@ -88,7 +88,7 @@ def in_image(second: int, ids: list[int]) -> Detections2D:
     )  # fmt: skip
 
 
-def test_a_map_must_have_what_was_plainly_seen_by_then_and_movers_while_they_are_in_view() -> None:
+def test_map_must_contain_plainly_seen_objects_and_visible_movers() -> None:
     """The table (12) is seen from the third second on, the ball (13) up to the fourth, the mug (11) always."""
     seen, must = VisibleImages(images=3), []
     labels = LabelSpace.read(Path(labels_file("simulator")))

@@ -44,7 +44,7 @@ def mapped(solid: Solid, label: str) -> Played:
         ("book", (0.62, 0.45, 0.06), (2.2, 0.2, 0.5)),  # an atlas that lies open
     ],
 )
-def test_what_is_seen_often_enough_is_in_the_map_whatever_its_size(
+def test_objects_seen_often_are_mapped_at_any_size(
     label: str, size: tuple[float, float, float], center: tuple[float, float, float]
 ) -> None:
     objects = mapped((center, size, 0.2, 0), label)["objects"][-1]
@@ -52,7 +52,7 @@ def test_what_is_seen_often_enough_is_in_the_map_whatever_its_size(
     assert np.linalg.norm((objects.centers[0] - center)[:2]) < 0.3
 
 
-def test_what_is_larger_than_usual_is_doubted_in_score_and_status() -> None:
+def test_unusually_large_object_is_doubted_in_score_and_status() -> None:
     armchair, chair = (
         mapped(((3.2, 0.2, size[2] / 2), size, 0.2, 0), "chair") for size in ((0.95, 0.95, 1.0), (0.45, 0.5, 0.95))
     )

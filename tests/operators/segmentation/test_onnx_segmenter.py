@@ -90,7 +90,7 @@ def test_classes_and_confidence_are_those_of_the_network_called_directly(tmp_pat
     np.testing.assert_allclose(found.confidence, softmax(scores).max(axis=0), atol=1e-4)
 
 
-def test_scores_at_a_fourth_of_the_resolution_are_enlarged_before_the_best_class_is_taken(tmp_path: Path) -> None:
+def test_low_resolution_scores_are_interpolated_before_argmax(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS, stride=4, size=(48, 64), metadata=NAMED)
     found = segmented(model=model, mean=(0, 0, 0), std=(1, 1, 1))
     tensor = (image().data / 255).transpose(2, 0, 1)[None].astype(np.float32)
@@ -129,7 +129,7 @@ def test_a_network_that_takes_bytes_is_given_the_pixels(tmp_path: Path) -> None:
         segmented(model=model, mean=(0.5, 0.5, 0.5))
 
 
-def test_blue_comes_first_where_the_network_wants_it(tmp_path: Path) -> None:
+def test_bgr_networks_get_blue_first(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS[:, ::-1], metadata=NAMED)
     other = save(tmp_path / "n.onnx", WEIGHTS, metadata=NAMED)
     np.testing.assert_array_equal(segmented(model=model, bgr=True).classes, segmented(model=other).classes)
@@ -156,7 +156,7 @@ def test_one_channel_is_a_class_and_its_background(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-margin)), atol=1e-4)
 
 
-def test_a_letterboxed_image_comes_back_without_its_border(tmp_path: Path) -> None:
+def test_letterboxed_segmentation_is_cropped_to_the_image(tmp_path: Path) -> None:
     # 64x24 in 32x24: 32x12 with 6 rows of grey above and below; scores are proportional to the pixel, so to the image.
     model = save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED)
     seen, plain = image(64, 24), {"mean": (0, 0, 0), "std": (1, 1, 1)}
@@ -181,7 +181,7 @@ def test_unsure_pixels_become_void_by_one_threshold_or_by_class(tmp_path: Path) 
         segmented(model=model, class_thresholds={"wal": 0.9})
 
 
-def test_the_status_tells_share_and_confidence_of_each_class(tmp_path: Path) -> None:
+def test_status_reports_share_and_confidence_of_each_class(tmp_path: Path) -> None:
     model = save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED)
     played = play(OnnxSegmenter(model=model, with_confidence=True), {"image": [image()]})
     (found,), (status,) = played["segmentation"], played["status"]
@@ -230,7 +230,7 @@ def test_void_pixels_are_not_painted_and_maps_of_other_images_are_refused() -> N
         (NAMED, {"output": "logits"}, "has no output 'logits'; it has planes"),
     ],
 )
-def test_what_does_not_fit_is_named(
+def test_mismatched_input_is_refused_with_the_mismatch(
     tmp_path: Path, metadata: dict[str, str], params: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(OperatorFailure, match=words):
@@ -302,7 +302,7 @@ def test_another_provider_is_refused(provider: str) -> None:
 
 
 @pytest.mark.long
-def test_an_exported_network_of_torchvision_gives_the_map_of_the_operator_for_those(tmp_path: Path) -> None:
+def test_exported_torchvision_network_equals_the_torchvision_operator(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     models = pytest.importorskip("torchvision.models")
     from operators.segmentation import TorchvisionSegmenter

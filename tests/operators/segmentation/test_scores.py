@@ -26,7 +26,7 @@ def enlarged(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     shape=st.tuples(st.integers(1, 32), st.integers(1, 6), st.integers(1, 6)),
     most=st.sampled_from([1, 3, 255]),
 )
-def test_the_class_is_that_of_the_greatest_enlarged_score_and_of_equal_ones_the_first(
+def test_best_class_is_the_first_maximum_of_the_enlarged_scores(
     seed: int, shape: tuple[int, int, int], most: int
 ) -> None:
     scores = np.random.default_rng(seed).integers(0, most, shape, np.uint8, endpoint=True)

@@ -53,7 +53,7 @@ def write_folder(folder: Path, count: int, seed: int = 0) -> Path:
     return folder
 
 
-def test_images_that_are_all_for_validation_are_trained_on_and_that_is_said(tmp_path: Path) -> None:
+def test_data_with_validation_images_only_is_trained_on_with_a_note(tmp_path: Path) -> None:
     write_folder(tmp_path, 2)
     (tmp_path / "val.txt").write_text("000.jpg\n001.jpg\n")
     data = read_segmentation_data(tmp_path)
@@ -133,7 +133,7 @@ def test_enlarging_keeps_each_cell_at_the_pixel_that_it_learns_from() -> None:
     torch.testing.assert_close(large[0, 0, 1, 2], (maps[0, 0, 0, 1] + maps[0, 0, 1, 1]) / 2)
 
 
-def test_letterboxed_images_get_a_map_of_their_own_shape(tmp_path: Path) -> None:
+def test_letterboxed_images_get_a_map_of_the_image_shape(tmp_path: Path) -> None:
     network = SegmentationNetwork(3, width=0.25)
     facts = {"kind": "segmenter", "classes": list("abc"), "width": 64, "height": 48}
     file = tmp_path / "n.onnx"

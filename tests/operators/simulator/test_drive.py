@@ -86,7 +86,7 @@ def test_a_shaken_inertial_unit_is_excited_in_all_axes() -> None:
     assert (shaken.std(axis=0) > 0.4).all()
 
 
-def test_a_robot_that_is_carried_ahead_goes_on_from_there() -> None:
+def test_robot_carried_ahead_continues_from_there() -> None:
     plain, carried = Trajectory(OVAL), Trajectory(OVAL, jumps=[(5.0, 0.25), (9.0, 0.5)])
     for t, ahead in ((4.99, 0.0), (5.0, 0.25), (8.9, 0.25), (9.0, 0.75), (20.0, 0.75)):
         expected, found = plain.at([t + ahead * plain.period]), carried.at([t])

@@ -119,7 +119,7 @@ def test_a_share_of_the_depth_is_missing_in_patches(
         assert (np.diff(gone.astype(int), axis=1) != 0).mean() < 0.3  # patches; of specks it would be half
 
 
-def test_a_knocked_camera_sees_from_elsewhere_than_its_calibration_says(
+def test_knocked_camera_deviates_from_its_calibration(
     healthy: dict[str, list[Any]], faulty: dict[str, list[Any]]
 ) -> None:
     apart = [(a.data != b.data).mean() for a, b in zip(healthy["image"], faulty["image"], strict=True)]
@@ -143,7 +143,7 @@ def test_a_wrong_focal_length_is_in_the_calibration_alone(healthy: dict[str, lis
     assert wrong["image_info"][0].fx == pytest.approx(1.1 * healthy["image_info"][0].fx)
 
 
-def test_a_clock_that_drifts_shows_what_was_ever_longer_before() -> None:
+def test_drifting_clock_delays_measurements_increasingly() -> None:
     quiet = {"rate": 50, "gyro_noise": 0, "gyro_walk": 0, "accel_noise": 0, "accel_walk": 0}
     right, wrong = (run(duration="4s", inertial={**quiet, "clock_drift": drift})["imu"] for drift in (0.0, 0.05))
     rate = [np.array([m.angular_velocity[2] for m in stream]) for stream in (right, wrong)]
@@ -180,7 +180,7 @@ def test_a_kidnapped_robot_leaps_and_its_sensors_do_not_notice() -> None:
     assert (event.stamp, event.names) == (4_000_000_000, ("kidnap",))
 
 
-def test_events_tell_what_begins_and_ends() -> None:
+def test_events_report_begin_and_end_of_faults() -> None:
     found = run(
         duration="3s", inertial={"rate": 1}, truth={**QUIET, "events": True},
         faults=[fault("inertial", (1.0, 2.0), frozen=1.0)], lighting=[{"span": [1.0, 2.5], "level": 0}],

@@ -30,7 +30,7 @@ def robot(world: str, seed: int, people: int = 3, **params: object) -> Simulated
 
 @pytest.mark.long
 @pytest.mark.parametrize(("world", "seed"), [("office", 801), ("corridor", 802), ("table_top", 803), ("yard", 804)])
-def test_who_chooses_and_most_of_what_there_is_to_choose_is_in_view(world: str, seed: int) -> None:
+def test_choosing_person_and_most_candidates_are_in_view(world: str, seed: int) -> None:
     """The head too, but at the table, where the camera looks down by 18 degrees and the round is near."""
     made = robot(world, seed)
     chooser, share, tops, chosen, seen = -1, [], [], set(), set()
@@ -78,7 +78,7 @@ def test_the_heading_is_that_of_the_camera_whatever_its_mount() -> None:
 
 
 @pytest.mark.long
-def test_world_without_choosers_is_refused_with_what_to_ask_for() -> None:
+def test_world_without_choosers_is_refused_with_a_hint() -> None:
     with pytest.raises(ValueError, match=r"no person here chooses .* give people: 3 or 4"):
         robot("office", 801, people=2)
 

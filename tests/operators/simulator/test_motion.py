@@ -45,7 +45,7 @@ def test_the_robot_stands_still_at_first_and_starts_without_a_jerk() -> None:
     assert np.abs(np.diff(motion.acceleration, axis=0)).max() < 0.05
 
 
-def test_the_path_closes_and_heading_goes_on() -> None:
+def test_path_closes_and_heading_accumulates() -> None:
     path = Trajectory(OVAL)
     first, again = path.at([1.0]), path.at([1.0 + path.period])
     np.testing.assert_allclose(again.position, first.position, atol=1e-9)
@@ -209,7 +209,7 @@ def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["office", pytest.param("corridor", marks=pytest.mark.long)])
-def test_a_robot_is_said_to_drive_while_it_moves_and_to_rest_while_it_stands(name: str) -> None:
+def test_robot_activity_is_driving_in_motion_and_resting_at_standstill(name: str) -> None:
     robot = next(thing for thing in world(name, 0).things if isinstance(thing.mover, Driving))
     seen = set()
     for t in np.arange(0.02, 150, 0.37):

@@ -170,7 +170,7 @@ def test_dropout_loses_its_share_and_outages_all_but_not_the_truth() -> None:
 
 
 @pytest.mark.long
-def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
+def test_delay_of_the_inertial_unit_shifts_its_measurements() -> None:
     quiet = {"rate": 100, "gyro_noise": 0, "gyro_walk": 0, "accel_noise": 0, "accel_walk": 0}
     sharp, late = (
         run(**{**OFF, "movers": False, "duration": "3s", "inertial": {**quiet, "delay": delay}})["imu"]

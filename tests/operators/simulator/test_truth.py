@@ -289,7 +289,7 @@ def test_a_goal_that_is_given_is_reached(robot: SimulatedRobot) -> None:
     assert "drink" in reached
 
 
-def test_what_is_on_something_touches_its_surface_from_above(robot: SimulatedRobot) -> None:
+def test_objects_touch_the_surface_of_their_carrier(robot: SimulatedRobot) -> None:
     """A ray downwards from just inside an object's bottom meets its carrier within a centimetre."""
     world = robot._stage.world
     checked = 0
@@ -334,7 +334,7 @@ def grasp_of(person: Person) -> Any:
     return next((act.grasp for act in person.timeline.acts if act.grasp is not None), None)
 
 
-def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
+def test_contacts_follow_the_activities_of_persons(robot: SimulatedRobot) -> None:
     world = robot._stage.world
     drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and grasp_of(t.mover) is not None]
     assert drinkers

@@ -51,7 +51,7 @@ def test_a_neighbour_seen_far_from_where_odometry_has_it_is_no_measurement(perio
     assert any(edge.loop for edge in graph.graph.edges) == joined
 
 
-def test_nodes_at_a_place_that_was_taken_back_leave_the_map_as_it_was() -> None:
+def test_withdrawn_nodes_leave_the_map_unchanged() -> None:
     graph = PlaceGraph[str](GraphSettings(), NoLooks, lambda node, T, covariance: 1e-6 * np.eye(6))
     for k in range(6):
         graph.grow(k, at(0.25 * k), 1e-6 * np.eye(6), 0, False, Eyes(0.0), lambda: "view")

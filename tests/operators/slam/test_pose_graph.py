@@ -98,7 +98,7 @@ def test_the_optimum_has_no_gradient_and_does_not_depend_on_where_it_is_looked_f
                 assert cost(moved) > least
 
 
-def test_a_wrong_loop_is_outvoted_and_told() -> None:
+def test_wrong_loop_closure_is_outvoted_and_down_weighted() -> None:
     truth, estimate, edges = ring(0)
     right = [*edges, loop(truth, 0, 60), loop(truth, 1, 59)]
     wrong = Edge(10, 40, np.eye(4), np.eye(6) * 1e4, True)

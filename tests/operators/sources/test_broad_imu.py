@@ -64,7 +64,7 @@ def test_a_wrong_broad_file_is_named(tmp_path: Path, changes: dict[str, Any], wo
         read_trial(trial(tmp_path / "a.hdf5", **changes))
 
 
-def test_what_is_no_broad_file_is_named(tmp_path: Path) -> None:
+def test_file_that_is_no_broad_trial_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.hdf5").write_text("words")
     with pytest.raises(SourceError, match="no HDF5 file"):
         read_trial(tmp_path / "a.hdf5")

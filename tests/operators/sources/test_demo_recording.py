@@ -111,7 +111,7 @@ def test_it_makes_the_same_first_second_to_the_bit_on_such_a_machine(demo: Recor
             assert [m.digest() for m in messages] == [m.digest() for m in recorded[stream]], stream
 
 
-def test_it_holds_what_its_page_says(page: str, demo: Recording) -> None:
+def test_demo_recording_holds_the_streams_of_its_page(page: str, demo: Recording) -> None:
     rows = re.findall(r"^\| `(robot1/robot/\w+)` \| (\w+) \| (\d+) \| (\d*) ?\|", page, flags=re.MULTILINE)
     held = {name: info for name, info in demo.streams.items() if info.count}
     assert {name for name, *_ in rows} == set(held)

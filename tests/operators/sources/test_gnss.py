@@ -179,7 +179,7 @@ def test_a_sentence_is_stamped_when_its_first_byte_came() -> None:
     assert stamps == [100, 300, 301]
 
 
-def test_what_is_held_of_an_endless_sentence_is_bounded() -> None:
+def test_buffer_of_an_endless_sentence_is_bounded() -> None:
     receiver = Receiver("antenna", "machine", 4.0)
     for _ in range(100):
         assert not list(receiver.feed(b"$" + b"A" * 1000, 0))

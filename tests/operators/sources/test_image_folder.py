@@ -144,7 +144,7 @@ def test_images_that_come_are_read_once_whole(tmp_path: Path) -> None:
     assert source.summary() == {"clock": "number", "left_out": 0}
 
 
-def test_what_is_no_file_is_no_image(tmp_path: Path) -> None:
+def test_pipes_folders_and_broken_links_are_no_images(tmp_path: Path) -> None:
     """Reading a pipe would wait for who writes into it."""
     fill(tmp_path, "a_1.png", "a_3.png")
     os.mkfifo(tmp_path / "a_2.png")

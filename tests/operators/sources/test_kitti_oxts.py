@@ -233,13 +233,13 @@ def test_a_recording_becomes_a_drive_whose_packets_read_as_its_messages(tmp_path
         ("odometry", "there is no stream of Odometry"),
     ],
 )
-def test_what_a_packet_lacks_is_said(tmp_path: Path, without: str, reason: str) -> None:
+def test_oxts_are_left_out_without_a_required_stream(tmp_path: Path, without: str, reason: str) -> None:
     folder, done = exported(recorded(tmp_path / "a.mcap", [LEVEL] * 3, without), tmp_path / "out")
     assert reason in done.left_out["oxts"]
     assert not (folder / "oxts").exists()
 
 
-def test_a_unit_whose_place_is_not_known_is_said(tmp_path: Path) -> None:
+def test_unit_without_extrinsics_is_exported_without_calibration(tmp_path: Path) -> None:
     folder, done = exported(recorded(tmp_path / "a.mcap", [LEVEL] * 3, "tf"), tmp_path / "out")
     assert (folder / "oxts/data/0000000002.txt").is_file()
     assert set(done.left_out) == {"calib_imu_to_velo.txt"}

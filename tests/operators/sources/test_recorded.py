@@ -254,7 +254,7 @@ def test_every_port_of_every_such_source_is_tried() -> None:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.source}.{case.port}")
-def test_what_was_measured_comes_with_the_stamp_at_which_it_was(case: Case, tmp_path: Path) -> None:
+def test_recorded_measurements_come_with_their_stamps(case: Case, tmp_path: Path) -> None:
     messages = played(case, tmp_path)
     assert type(messages[0]).__name__ in [t.__name__ for t in spec_of(case.source).outputs[case.port].types]
     if case.static:
@@ -278,7 +278,7 @@ def test_a_topic_of_another_kind_is_refused_by_name(source: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_run_without_a_recording_says_what_to_do(source: str) -> None:
+def test_recorded_source_without_a_recording_raises_with_the_remedy(source: str) -> None:
     operator: Source = getattr(sources, source)()
     with pytest.raises(RuntimeError, match=f"{source} stands for streams of a recording.*dataflow replay RECORDING"):
         operator.setup()

@@ -315,7 +315,7 @@ def test_the_values_show_the_unit_of_depth(tmp_path: Path, write, unit, guessed,
         (12.0, 13.0, "WARNING"),  # far in either unit
     ],
 )
-def test_doubt_about_the_unit_leaves_the_layouts_and_is_said_once(
+def test_doubtful_depth_unit_keeps_that_of_the_layout_and_logs_once(
     tmp_path: Path, near: float, far: float, level: str, caplog
 ) -> None:
     caplog.set_level("INFO")
@@ -335,7 +335,7 @@ def test_a_given_unit_is_taken_without_a_word(tmp_path: Path, caplog) -> None:
     assert not caplog.records
 
 
-def test_a_damaged_image_beyond_what_is_read_does_not_count(tmp_path: Path) -> None:
+def test_damaged_image_beyond_the_range_read_is_ignored(tmp_path: Path) -> None:
     fill(write_7scenes(tmp_path), ramp(0.8, 4.0, 1000))
     (tmp_path / "frame-000002.depth.png").write_bytes(b"junk")
 

@@ -109,7 +109,7 @@ def test_the_calibration_follows_the_field_of_view_or_the_focal_length(clip: Pat
 
 
 @pytest.mark.parametrize(("content", "wrong"), [(None, "no file .*x.avi"), (b"no video", "is no video")])
-def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes | None, wrong: str) -> None:
+def test_file_that_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes | None, wrong: str) -> None:
     path = tmp_path / "x.avi"
     if content is not None:
         path.write_bytes(content)

@@ -92,7 +92,7 @@ def test_the_joined_track_has_the_older_id_whichever_of_the_two_goes_on(younger:
     assert ids(tracked([*both, *one])[-1], TrackState.CONFIRMED, TrackState.COASTING) == [1]
 
 
-def test_what_was_seen_apart_goes_on_by_weak_boxes_beside_another() -> None:
+def test_separate_tracks_continue_by_weak_boxes_when_they_meet() -> None:
     """Two enter together, one before the other, part, and meet again: the hidden one has weak boxes then."""
     images = [image(k, [walker(100), walker(118 + 12 * k)]) for k in range(5)]
     images += [image(k, [walker(100), walker(166 - 12 * (k - 4), 0.8 if k < 7 else 0.2)]) for k in range(5, 12)]
@@ -173,7 +173,7 @@ def test_unusable_boxes_are_counted_and_survived() -> None:
     assert status.levels[0] == 1
 
 
-def test_another_image_size_begins_anew_and_another_camera_is_refused() -> None:
+def test_another_image_size_resets_the_tracks_and_another_camera_is_refused() -> None:
     changed = [image(k, [walker(100)], width=640 if k < 3 else 320) for k in range(6)]
     assert ids(tracked(changed)[-1]) == [2]
     with pytest.raises(OperatorFailure, match="detections are of camera rear, those before were of camera"):

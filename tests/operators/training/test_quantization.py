@@ -75,7 +75,7 @@ def test_the_same_images_give_the_same_bytes(trained: Path, worlds: Path, tmp_pa
     assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
 
 
-def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, worlds: Path, tmp_path: Path) -> None:
+def test_refused_quantization_leaves_no_file(trained: Path, worlds: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.onnx"
     with pytest.raises(ValueError, match="measured on images, and there is none"):
         quantize_network(trained / "detector.onnx", [], small)

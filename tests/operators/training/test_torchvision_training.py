@@ -123,7 +123,7 @@ def test_a_run_that_was_resumed_ends_with_the_same_bits(data: Path, tmp_path: Pa
 
     loop(task(), settings, tmp_path / "whole.pth")
     with pytest.raises(Interrupted):
-        loop(task(), settings, tmp_path / "halved.pth", progress=interrupted(2))
+        loop(task(), settings, tmp_path / "halved.pth", progress=interrupted(1))
     loop(task(), settings, tmp_path / "halved.pth", resume=True)
     whole, halved = (load_safely(tmp_path / f"{name}.pth")["model"] for name in ("whole", "halved"))
     assert all(torch.equal(whole[name], halved[name]) for name in whole)
@@ -139,7 +139,7 @@ def test_a_run_that_was_resumed_ends_with_the_same_bits(data: Path, tmp_path: Pa
         ([DETECTOR, "nowhere"], "no data folder 'nowhere'"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_arguments_are_refused_with_a_hint(
     words: list[str], told: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

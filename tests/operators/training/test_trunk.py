@@ -83,7 +83,9 @@ def test_a_head_behind_another_range_computes_what_it_did(apart: Path, tmp_path:
 
 
 @pytest.mark.long
-def test_what_cannot_share_is_told_and_leaves_no_file(trained: Path, apart: Path, worlds: Path, tmp_path: Path) -> None:
+def test_networks_that_cannot_share_are_refused_and_leave_no_file(
+    trained: Path, apart: Path, worlds: Path, tmp_path: Path
+) -> None:
     out = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
     with pytest.raises(TrainingFileError, match=r"detector\.onnx is not in 8 bits: `dataflow train quantize`"):
         share_trunk(trained / "detector.onnx", apart / "segmenter.onnx", *out)

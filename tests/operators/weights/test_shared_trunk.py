@@ -111,7 +111,7 @@ def test_maps_cannot_be_changed() -> None:
             each[:] = 0
 
 
-def test_a_network_with_another_weight_has_a_trunk_of_its_own(tmp_path: Path) -> None:
+def test_network_with_another_weight_does_not_share_the_trunk(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="models are changed with the extra [train]")
     shipped_one = open_network(FILES["detector"], "detector")
     same = open_network(with_facts(FILES["detector"], tmp_path / "same.onnx", seed=99), "detector")
@@ -144,7 +144,7 @@ def test_a_file_that_names_no_trunk_runs_as_a_whole(tmp_path: Path, computed: li
         (["/0/Div_output_0"], r"must end with tensor\(uint8\); '/0/Div_output_0' is tensor\(float\)"),
     ],
 )
-def test_a_trunk_that_does_not_fit_is_told(tmp_path: Path, ends: object, told: str) -> None:
+def test_unfit_trunk_is_refused_with_the_file(tmp_path: Path, ends: object, told: str) -> None:
     file = with_facts(FILES["detector"], tmp_path / "bad.onnx", trunk=ends)
     with pytest.raises(NetworkFileError, match=told) as error:
         open_network(file, "detector")

@@ -84,7 +84,7 @@ def test_a_jacobian_is_the_derivative_of_its_residual(model: Model) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
-def test_a_measurement_comes_back_from_a_snapshot(model: Model) -> None:
+def test_measurement_is_restored_from_a_snapshot(model: Model) -> None:
     again = typed(Model, unpack_state(pack_state({"model": plain(model)}))["model"])
     assert type(again) is type(model)
     one, other = (m.innovation(state(1), np.ones(3)) for m in (model, again))
@@ -180,7 +180,7 @@ def _nees(error: Array, covariance: Array, block: slice) -> float:
 
 
 @pytest.mark.long
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_are_consistent_with_the_covariance() -> None:
     from scipy.stats import chi2  # takes a second
 
     checks = [1.5, 3.0, 4.48, 5.4]
@@ -190,7 +190,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     assert ((anees > low) & (anees < high)).all(), anees
 
 
-def test_rest_is_told_from_motion() -> None:
+def test_rest_is_distinguished_from_motion() -> None:
     t = np.arange(25) / RATE
     for begin, expected in ((0.0, True), (3.0, False)):
         gyro, accel = Motion().readings(t + begin)

@@ -101,7 +101,7 @@ def test_late_measurements_give_the_bits_of_those_in_time(lateness: list[int]) -
     assert {k: h.used for k, h in inorder.health.items()} == {k: h.used for k, h in late.health.items()}
 
 
-def test_what_is_too_late_is_counted() -> None:
+def test_late_measurements_are_ignored_and_counted() -> None:
     made = Made(4.0)
     filter = made.filter(window=0.5)
     made.fed(filter, made.fixes[3:])
@@ -186,7 +186,7 @@ def test_without_inertial_sensor_the_velocity_stays() -> None:
 
 
 @pytest.mark.long
-def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and_not_at_rest() -> None:
+def test_alternative_headings_expire_in_motion_only() -> None:
     rng, still = np.random.default_rng(0), np.array([0.0, 0.0, 9.80665])
     samples = [
         Sample(ns(0.05 * k), 4e-3 * rng.standard_normal(3), still + 0.05 * rng.standard_normal(3), NOISE)
@@ -211,7 +211,7 @@ def test_alternatives_to_the_given_heading_are_followed_for_a_time_in_motion_and
 
 
 @pytest.mark.parametrize("heading", [0.0, None])
-def test_a_snapshot_goes_on_with_equal_bits(heading: float | None) -> None:
+def test_restored_filter_continues_bit_for_bit(heading: float | None) -> None:
     made = Made(3.0)
     one = made.filter(heading=heading)
     half = 70

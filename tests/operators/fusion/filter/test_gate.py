@@ -30,7 +30,7 @@ def test_a_device_that_has_leapt_leaps_under_its_other_names(name: str, kind: st
     assert leapt(name, kind, 0.9, LEAPT) == pytest.approx(0.6)
 
 
-def test_what_fits_does_not_leap_nor_what_another_device_says_nor_what_comes_later() -> None:
+def test_fitting_other_or_later_measurements_do_not_leap() -> None:
     assert leapt("wheels standstill", "Velocity", 0.9, LEAPT, residual=0.01) == 0.0
     assert leapt("camera", "Velocity", 0.9, LEAPT) == 0.0
     assert leapt("wheels no turn", "AngularRate", 1.5, LEAPT) == 0.0
@@ -87,7 +87,7 @@ def test_a_place_that_repeats_is_frozen_where_the_body_has_left_it(
     assert frozen(state_of(speed, sigma), seconds) == expected
 
 
-def test_a_place_that_contradicted_the_estimate_from_the_first_shows_nothing_by_repeating() -> None:
+def test_repeated_place_that_never_fitted_is_no_evidence() -> None:
     first = repeat_of(None, measured(0.0, Position(PLACE, ZERO)), state_of(0.8), fits=False)
     again = repeat_of(first, measured(0.4, Position(PLACE, ZERO)), state_of(0.8), fits=False)
     assert (again.speed, again.frozen) == (0.0, False)
@@ -97,7 +97,7 @@ def test_the_least_change_of_a_place_is_no_repeat() -> None:
     assert not frozen(state_of(0.8), 0.4, np.nextafter(PLACE, 9.0))
 
 
-def test_what_is_frozen_stays_so_at_rest_until_the_place_changes() -> None:
+def test_frozen_position_stays_frozen_at_rest_until_it_changes() -> None:
     before = Repeat(PLACE, 0, frozen=True)
     again = repeat_of(before, measured(9.0, FullPose(PLACE, np.eye(3))), state_of(0.0), fits=True)
     assert again.frozen
@@ -107,9 +107,7 @@ def test_what_is_frozen_stays_so_at_rest_until_the_place_changes() -> None:
 
 
 @pytest.mark.parametrize(("sigma", "idle"), [(0.01, False), (0.2, True)])
-def test_a_body_that_has_braked_since_may_stand_at_the_place_and_one_that_may_drive_on_may_not(
-    sigma: float, idle: bool
-) -> None:
+def test_repeated_place_after_braking_may_be_standstill(sigma: float, idle: bool) -> None:
     first = repeat_of(Repeat(PLACE, 0), measured(0.2, Position(PLACE, ZERO)), state_of(0.8), fits=True)
     second = repeat_of(first, measured(0.4, Position(PLACE, ZERO)), state_of(0.01, sigma), fits=True)
     assert ((second.speed > 0), second.frozen) == (idle, False)

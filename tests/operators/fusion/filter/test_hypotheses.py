@@ -25,16 +25,14 @@ STATE = State(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.
         (0.9, False, True),
     ],
 )
-def test_the_given_heading_is_in_question_from_a_chance_of_one_in_thirty_until_one_in_a_hundred(
-    wrong: float, before: bool, expected: bool
-) -> None:
+def test_given_heading_is_doubted_with_hysteresis(wrong: float, before: bool, expected: bool) -> None:
     """Two headings against it, one of which alone would not do."""
     weights = [math.log(1 - wrong), *[math.log(wrong / 2)] * 2]
     hypotheses = [Hypothesis(w, STATE, against=k > 0) for k, w in enumerate(weights)]
     assert doubted(hypotheses, before) == expected
 
 
-def test_alternatives_to_the_given_heading_begin_with_a_chance_at_which_none_is_in_question() -> None:
+def test_alternative_headings_begin_without_doubting_the_given_one() -> None:
     samples = [Sample(k * 10**7, np.zeros(3), np.array([0, 0, 9.81]), Noise(1e-3, 1e-2, 1e-5, 1e-4)) for k in range(50)]
     node = first_node(samples, Prior(heading=0.3, heading_sigma=0.05), 9.81, at_rest=True)
     assert len(node.hypotheses) == 12

@@ -63,7 +63,7 @@ def nees(filter: ErrorStateFilter, seconds: float = 10.0) -> float:
 
 
 @pytest.mark.long
-def test_a_drift_taken_for_noise_makes_the_covariance_too_small_and_a_state_does_not() -> None:
+def test_drift_state_keeps_the_covariance_consistent() -> None:
     drifting = SensorErrors(drifts=(("fix", (DRIFT,) * 3, 1000.0),))
     white = np.mean([nees(driven(seed, SensorErrors())) for seed in range(6)])
     held = np.mean([nees(driven(seed, drifting)) for seed in range(6)])
@@ -71,7 +71,7 @@ def test_a_drift_taken_for_noise_makes_the_covariance_too_small_and_a_state_does
     assert 1.0 < held < 6.0  # its 95 % band is 1.4-5.3 over six
 
 
-def test_a_position_is_no_surer_than_its_drift_and_comes_back_from_a_snapshot() -> None:
+def test_position_covariance_is_bounded_by_the_drift_and_restored() -> None:
     config = FilterConfig(errors=SensorErrors(drifts=(("fix", (DRIFT, DRIFT, 2 * DRIFT), 1000.0),)))
     filter = driven(1, config.errors)
     sigmas = np.sqrt(np.diag(filter.estimate(filter.time)[0].covariance)[:3])
@@ -92,7 +92,7 @@ def test_an_unobservable_drift_keeps_its_spread() -> None:
 
 
 @pytest.mark.parametrize("kind", ["drift", "scale"])
-def test_what_an_error_does_to_a_residual_is_its_jacobian(kind: str) -> None:
+def test_jacobians_of_sensor_errors_match_differences(kind: str) -> None:
     errors = SensorErrors((("a", 0.1),), (("fix", (1.0, 1.0, 1.0), 9.0),), (("wheels", 0.01),))
     rng = np.random.default_rng(0)
     model = (
@@ -118,7 +118,7 @@ def test_what_an_error_does_to_a_residual_is_its_jacobian(kind: str) -> None:
         np.testing.assert_allclose((here - there) / 1e-4, J[:, SIZE + k], atol=1e-9)
 
 
-def test_settings_ask_for_errors_and_the_noise_is_what_is_left() -> None:
+def test_settings_enable_error_states_and_reduce_the_noise() -> None:
     settings = {
         "robot/fix": SensorSettings(drift=(0.3, 0.3, 0.6), drift_time=20.0),
         "robot/wheels": SensorSettings(use="wheels", scale_sigma=0.02),
@@ -140,7 +140,7 @@ def test_settings_ask_for_errors_and_the_noise_is_what_is_left() -> None:
     assert noise[0, 0] == pytest.approx(0.025)
 
 
-def test_settings_without_errors_leave_the_state_as_it_was() -> None:
+def test_settings_without_errors_add_no_error_states() -> None:
     assert errors_of({"robot/fix": SensorSettings()}).sigmas == []
 
 
@@ -210,7 +210,7 @@ def test_offsets_come_back_from_a_snapshot_and_older_snapshots_get_them() -> Non
     assert more.offsets()["z"][1] == pytest.approx(0.3, rel=0.01)
 
 
-def test_the_operator_says_what_it_found_and_its_poses_are_right() -> None:
+def test_operator_reports_the_estimated_offset_and_its_poses_are_right() -> None:
     robot = Robot(8.0)
     late = [p.replace(stamp=p.stamp + 120_000_000) for p in robot.poses()]
     found: dict[str, Any] = {}

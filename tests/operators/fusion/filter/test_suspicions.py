@@ -127,7 +127,7 @@ def test_a_motion_that_was_felt_moves_any_state_as_its_samples_do_one_by_one() -
         assert np.allclose(apart, F[:, k], atol=2e-3)
 
 
-def test_a_window_begins_anew_where_nothing_was_felt_and_counts_a_sensor_five_times_a_second() -> None:
+def test_window_restarts_at_inertial_gaps_and_samples_a_sensor_at_5_hz() -> None:
     drive = Drive(seconds=2)
     window = drive.window(wheels=True)
     assert len(window.steps) == 2 * 10
@@ -142,7 +142,7 @@ def test_rest_has_no_scale() -> None:
     assert suspected(Velocity(np.array([0.5, 0.0, 0.0]), np.eye(3), ZERO)) == SCALE
 
 
-def test_a_filter_that_is_sure_of_a_wrong_heading_begins_anew_where_the_motion_of_late_contradicts_it() -> None:
+def test_overconfident_wrong_heading_restarts_the_filter_on_contradicting_motion() -> None:
     """Headings of the estimate are 0.6 rad off, and taken to be within 0.02."""
     drive = Drive(seconds=16)
     sigmas = np.repeat([0.02, 0.02, 0.02, 0.001, 0.01], 3)
@@ -167,7 +167,7 @@ def test_a_filter_that_is_sure_of_a_wrong_heading_begins_anew_where_the_motion_o
 
 
 @pytest.mark.parametrize(("old", "off", "restarts"), [(False, 1.0, True), (True, 1.0, False), (True, 1.25, True)])
-def test_a_filter_older_than_the_window_begins_anew_by_stronger_evidence(old: bool, off: float, restarts: bool) -> None:
+def test_filter_older_than_the_window_restarts_on_stronger_evidence_only(old: bool, off: float, restarts: bool) -> None:
     """An hour has 180 windows: one in a thousand differs by 0.95 rad, 60 in a million by 1.1."""
     ones = State(ZERO, ZERO, np.eye(3), ZERO, ZERO, np.eye(SIZE) * 0.16**2)
     window = replace(Drive(seconds=26).window(), motion=None)

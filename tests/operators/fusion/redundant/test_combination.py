@@ -48,7 +48,7 @@ def test_positions_are_combined_as_by_weighted_least_squares(seed: int) -> None:
     assert np.allclose(point, expected @ pulls, atol=1e-6)
 
 
-def test_triangulated_points_are_as_good_as_their_covariance_says() -> None:
+def test_triangulation_errors_are_consistent_with_the_covariance() -> None:
     rng = np.random.default_rng(0)
     normalised = []
     for _ in range(400):
@@ -59,7 +59,7 @@ def test_triangulated_points_are_as_good_as_their_covariance_says() -> None:
     assert np.mean(normalised) == pytest.approx(3.0, abs=0.4)
 
 
-def test_a_range_sharpens_what_bearings_leave_open() -> None:
+def test_range_reduces_the_covariance_along_the_bearings() -> None:
     rng = np.random.default_rng(1)
     point = np.array([6.0, 0.2, 0.3])
     rays = [ray(rng, np.array([0.0, y, 0.0]), point, 0.004) for y in (-0.1, 0.1)]

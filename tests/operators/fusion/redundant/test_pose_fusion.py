@@ -67,7 +67,7 @@ def test_poses_and_an_orientation_near_half_a_turn_are_averaged_on_the_manifold(
     assert operator.summary()["ignored, position or orientation unknown"] == 3
 
 
-def test_two_poses_that_contradict_each_other_are_a_diagnostic_and_the_covariance_holds_both() -> None:
+def test_contradicting_poses_are_reported_and_inflate_the_covariance() -> None:
     rng = [np.random.default_rng(k) for k in range(2)]
     played, operator = body({"camera": poses(5, rng[0]), "lidar": poses(5, rng[1], off=0.5)})
     assert operator.summary()["two sensors contradicted each other"] == 5
@@ -76,7 +76,7 @@ def test_two_poses_that_contradict_each_other_are_a_diagnostic_and_the_covarianc
         assert status.messages[0] == "sensors contradict each other"
 
 
-def test_a_sensor_noisier_than_it_says_loses_its_say() -> None:
+def test_sensor_noisier_than_its_covariance_is_down_weighted() -> None:
     rng = np.random.default_rng(4)
     noisy = [p.replace(position=p.position + rng.normal(0, 0.05, 3)) for p in poses(200, rng)]
     played, _ = body({"a": poses(200, rng), "b": poses(200, rng), "noisy": noisy})
@@ -147,7 +147,7 @@ def test_poses_that_do_not_come_after_the_last_are_counted() -> None:
     assert operator.summary()["ignored, camera/pose: stamp not later than the last"] == 2
 
 
-def test_what_can_never_be_fused_is_refused_by_name() -> None:
+def test_unfusable_poses_are_refused_with_the_stream() -> None:
     operator = PoseFusion()
     operator.setup()
     pose = poses(1, np.random.default_rng(0))[0]

@@ -91,7 +91,7 @@ def test_two_cameras_triangulate_and_a_lidar_makes_it_better() -> None:
     assert np.mean(normalised) == pytest.approx(3.0, abs=0.8)
 
 
-def test_one_camera_alone_gives_no_place_and_says_why() -> None:
+def test_single_bearing_gives_no_position_and_is_counted() -> None:
     played, operator = fused({"left": camera("left", 5, np.random.default_rng(0))})
     assert [m.count for m in played["places"]] == [0] * 5
     assert operator.summary()["ignored, a single bearing"] == 10
@@ -117,7 +117,7 @@ def process(operator: PositionFusion, message: LandmarkSightings) -> None:
     operator.process({"ns/lidar/things": message}, Context(message.stamp), {"ns/robot/extrinsics": mounts()})
 
 
-def test_sightings_that_cannot_be_used_are_counted_with_the_reason_and_the_others_serve() -> None:
+def test_unusable_sightings_are_counted_by_reason_and_others_used() -> None:
     operator = PositionFusion()
     operator.setup()
     good = lidar(1, np.random.default_rng(0))[0]
@@ -154,7 +154,7 @@ def test_two_plays_give_equal_bits() -> None:
     assert plays[0] == plays[1]
 
 
-def test_each_sensor_may_have_a_stream_of_its_own() -> None:
+def test_extrinsics_may_come_on_one_stream_per_sensor() -> None:
     rng = np.random.default_rng(4)
     whole = mounts()
     apart = {

@@ -85,7 +85,7 @@ def walked(seconds: float, stop: float) -> tuple[Array, Array]:
 
 
 @pytest.mark.long
-def test_what_was_put_down_stays_where_it_is() -> None:
+def test_device_put_down_stays_in_place() -> None:
     velocity, tremble = walked(18.0, 7.0)
     _, without = outage(velocity, tremble, 8.0)
     operator, held = outage(velocity, tremble, 8.0, standstill=0.1)
@@ -93,7 +93,7 @@ def test_what_was_put_down_stays_where_it_is() -> None:
     assert count(operator, "standstill velocity, used") > 80
 
 
-def test_what_trembles_as_it_moves_slowly_is_not_taken_for_standing() -> None:
+def test_slow_trembling_motion_is_not_taken_for_standstill() -> None:
     t = np.arange(10 * RATE) / RATE
     velocity = np.column_stack([0.05 * np.clip(t - 0.8, 0, 1), 0 * t, 0 * t])
     operator, _ = outage(velocity, 0.3 * (t > 0.8), 10.0, standstill=0.1)
@@ -102,7 +102,7 @@ def test_what_trembles_as_it_moves_slowly_is_not_taken_for_standing() -> None:
 
 
 @pytest.mark.long
-def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
+def test_known_even_motion_is_not_taken_for_standstill() -> None:
     t = np.arange(12 * RATE) / RATE
     velocity = np.column_stack([0.5 * np.clip(t - 1.5, 0, 1), 0 * t, 0 * t])  # without a tremble: as a rail
     without, off = outage(velocity, 0 * t, 8.0)
@@ -113,7 +113,7 @@ def test_an_even_motion_that_the_filter_knows_is_not_stopped() -> None:
 
 
 @pytest.mark.long
-def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
+def test_no_slip_constraint_reduces_drift() -> None:
     t = np.arange(22 * RATE) / RATE
     speed = 0.8 * np.clip((t - 0.8) / 2, 0, 1)
     yaw = 0.8 * np.sin(0.5 * np.clip(t - 0.8, 0, None))
@@ -124,7 +124,7 @@ def test_what_rolls_drifts_less_where_it_cannot_slip() -> None:
     assert count(operator, "slip, used") > 150
 
 
-def test_slip_is_bounded_ten_times_a_second_beside_what_rolls() -> None:
+def test_slip_constraint_is_applied_at_10_hz() -> None:
     at = np.eye(4)
     at[:3, :3], at[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0.2, 0.3]  # the base looks along the body's y
     constraints = Constraints(None, 0.02)

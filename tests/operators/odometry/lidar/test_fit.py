@@ -42,7 +42,7 @@ def laid(axes: tuple[int, ...], T: Array, start: Array) -> Fit:
     return fit(scan, planes, prior, lambda T: np.zeros(6), 0.02)
 
 
-def test_a_scan_between_walls_is_laid_where_it_was_taken() -> None:
+def test_scan_between_walls_is_registered_at_its_pose() -> None:
     found = laid((0, 1, 2), TRUTH, np.eye(4))
     assert np.abs(se3.log(invert(TRUTH) @ found.T)).max() < 2e-3
     assert found.blind.shape == (0, 6)
@@ -68,7 +68,7 @@ def test_along_a_direction_that_no_wall_crosses_the_prediction_stands_and_is_nam
     assert sigma[axis] > 20 * np.delete(sigma[:3], axis).max()
 
 
-def test_a_floor_and_a_ceiling_hold_height_roll_and_pitch_and_leave_the_rest_where_it_was_predicted() -> None:
+def test_floor_and_ceiling_constrain_height_roll_and_pitch_only() -> None:
     """However little is known of the motion: the pose does not run away along what nothing holds."""
     found = laid((2,), TRUTH, np.eye(4))
     assert len(found.blind) == 3
@@ -120,7 +120,7 @@ def test_poses_agree_by_how_many_points_lie_on_planes() -> None:
 # -- the motion --------------------------------------------------------------------------------------------------
 
 
-def test_a_motion_goes_on_for_as_long_as_the_patience_and_then_stands() -> None:
+def test_predicted_motion_stops_after_the_patience() -> None:
     velocity = np.array([1.0, 0.2, 0.0, 0.0, 0.0, 0.5])
     motion = LidarMotion(2 * SECOND, TRUTH, velocity, np.zeros((6, 6)), fresh=False)
     np.testing.assert_allclose(motion.predicted(2 * SECOND + SECOND // 2, 0.8), TRUTH @ se3.exp(0.5 * velocity))
@@ -137,7 +137,7 @@ def test_a_sweep_is_deskewed_by_the_mean_velocity_since_the_last_pose_but_one() 
     np.testing.assert_allclose(first.sweep_velocity(here, 3 * SECOND // 2)[:3], [0.4, 0.0, 0.0], atol=1e-12)
 
 
-def test_the_spread_of_a_prediction_grows_with_time_and_is_that_of_any_speed_at_first() -> None:
+def test_prediction_spread_grows_with_time_and_starts_at_any_speed() -> None:
     known = LidarMotion(0, np.eye(4), np.zeros(6), np.zeros((6, 6)), fresh=False)
     np.testing.assert_allclose(np.sqrt(np.diag(known.spread(SECOND // 5, 10.0, 5.0, 30.0))), [0.4] * 3 + [0.2] * 3)
     fresh = LidarMotion(0, np.eye(4), np.zeros(6), np.zeros((6, 6)))
@@ -157,7 +157,7 @@ def test_an_error_before_a_pose_and_one_behind_it_are_the_same_error() -> None:
     np.testing.assert_allclose(np.cov(np.array(left).T), expected, atol=0.3 * expected.max())
 
 
-def test_what_a_scan_holds_errs_as_the_map_does_and_the_rest_as_the_last_pose_and_the_motion() -> None:
+def test_constrained_directions_take_the_map_covariance_and_others_the_predicted_one() -> None:
     of_map, of_last, spread = 1e-4 * np.eye(6), 4e-2 * np.eye(6), 1e-2 * np.eye(6)
     held = np.diag([0.0, 1e6, 1e6, 1e6, 1e6, 1e6])  # nothing along x
     covariance, own = corrected(np.eye(4), held, spread, of_map, of_last)

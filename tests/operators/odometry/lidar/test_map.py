@@ -146,7 +146,7 @@ def test_a_plane_is_as_old_as_its_first_fit_not_as_its_voxel() -> None:
     assert set(planes.pairs(flat).births.tolist()) == {4}
 
 
-def test_a_map_keeps_what_is_near_and_forgets_the_rest() -> None:
+def test_map_keeps_near_planes_and_forgets_the_rest() -> None:
     planes, far = PlaneMap(2.0, 2), slope(4000, reach=3.0) + AWAY
     planes.add(np.concatenate([slope(4000, reach=3.0), far]), birth=3)
     before = len(planes)

@@ -96,7 +96,7 @@ def test_points_with_times_are_deskewed() -> None:
 
 
 @pytest.mark.long
-def test_points_without_times_are_deskewed_by_their_azimuth_where_it_is_known_how_the_lidar_turns() -> None:
+def test_points_without_times_are_deskewed_by_azimuth() -> None:
     clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
     plain = [c.replace(time_offsets=None) for c in clouds]
     timed = errors(play(LidarOdometry(), {"cloud": clouds}), circling)
@@ -116,7 +116,7 @@ def test_points_without_times_are_deskewed_by_their_azimuth_where_it_is_known_ho
     ],
     ids=["ends at the stamp", "clockwise", "begins behind, at the stamp", "stamped in the middle"],
 )
-def test_the_azimuth_of_a_point_tells_when_it_was_measured(sweep: Sweep, expected: list[float]) -> None:
+def test_azimuth_of_a_point_gives_its_time_offset(sweep: Sweep, expected: list[float]) -> None:
     around = np.array([[2, 0, 1], [0, 3, 0], [-1, 0, 0], [0, -4, 2]], np.float32)
     np.testing.assert_allclose(sweep.offsets(around), expected, atol=1e-7)
     assert np.isnan(sweep.offsets(np.full((1, 3), np.nan, np.float32))).all()
@@ -158,7 +158,7 @@ def test_position_along_a_bare_corridor_is_unconstrained_and_its_covariance_grow
     assert np.abs(off[1:3]).max() < 0.03
 
 
-def test_an_epoch_of_the_map_begins_where_the_pose_moved_or_became_much_less_certain() -> None:
+def test_map_epoch_begins_when_the_pose_moved_or_lost_certainty() -> None:
     """What is seen first then is as unsure as the pose, what was seen before stays as it was."""
     operator = LidarOdometry()
     operator.setup()
@@ -182,7 +182,7 @@ def test_an_epoch_of_the_map_begins_where_the_pose_moved_or_became_much_less_cer
     assert set(grown._map.pairs(old).births.tolist()) == {0}
 
 
-def test_a_pose_after_a_first_step_that_was_missed_is_believed_only_where_half_of_the_scan_is_mapped() -> None:
+def test_pose_after_a_missed_first_step_requires_half_of_the_scan_mapped() -> None:
     """The velocity is not known, so the sensor may be beyond all that was searched."""
     operator = LidarOdometry()
     operator.setup()
@@ -300,7 +300,7 @@ def aslant(t: float) -> Array:
 
 @pytest.mark.parametrize("x", [3.4, *(pytest.param(x, marks=pytest.mark.long) for x in (2.6, 4.3, 5.7))])
 @pytest.mark.parametrize("height", [0.3, 1.2])
-def test_in_a_corridor_with_one_thing_in_it_the_way_along_it_is_within_what_is_claimed(x: float, height: float) -> None:
+def test_error_along_a_corridor_with_one_object_is_within_its_covariance(x: float, height: float) -> None:
     world = CORRIDOR + cabinet(x, height)
     played = play(LidarOdometry(), {"cloud": [scan(world, aslant, k) for k in range(12)]})
     off = errors(played, aslant)

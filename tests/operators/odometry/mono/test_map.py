@@ -63,7 +63,7 @@ def test_points_are_added_replaced_and_removed_by_number() -> None:
     np.testing.assert_array_equal(pixels, seen(pose(3), POINTS[[4]]))
 
 
-def test_the_typical_depth_is_the_median_of_what_the_newest_keyframe_saw_before_the_camera() -> None:
+def test_typical_depth_is_the_median_over_visible_points_of_the_newest_keyframe() -> None:
     points = np.array([[0, 0, 1.0], [0, 0, 2], [0, 0, 4], [0, 0, -9], [0, 0, 50]])
     newest = View(1, np.eye(4), GRAY, np.array([0, 1, 2, 3]), np.zeros((4, 2)))
     known = MonoMap((newest,), np.arange(5), points)
@@ -119,7 +119,7 @@ def test_an_adjustment_puts_the_newest_keyframes_and_what_they_saw_in_their_plac
     np.testing.assert_allclose(adjusted.points[right], POINTS[right], atol=5e-3)
 
 
-def test_a_map_that_is_resized_sees_what_it_saw() -> None:
+def test_rescaled_map_keeps_its_projections() -> None:
     known, centre = whole(3), np.array([0.3, -0.2, 1.0])
     known = replace(known, views=tuple(replace(v, covariance=np.eye(6)) for v in known.views))
     larger, metric = known.resized(2.5, centre), known.in_metres(2.5, centre)

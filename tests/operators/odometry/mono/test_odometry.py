@@ -86,7 +86,7 @@ def test_an_odometry_of_another_stamp_is_carried_to_the_image_by_its_velocity() 
     assert operator.state.odometry.T_reference is None
 
 
-def test_parameters_are_by_default_what_settings_are() -> None:
+def test_default_parameters_equal_the_default_settings() -> None:
     assert MonoVisualOdometry()._config() == MonoOdometryConfig()
 
 

@@ -178,7 +178,7 @@ def test_depth_that_contradicts_a_known_scale_is_left_out() -> None:
     assert operator.summary()[f"depth {RangingUse.CONTRARY}"] == PERSISTENT - 1
 
 
-def test_a_scale_that_was_wrong_is_found_anew_without_a_jump_and_the_way_so_far_is_doubted() -> None:
+def test_wrong_scale_is_corrected_without_a_jump_and_raises_the_covariance() -> None:
     wrong = {k: (1.5 * measured(k)).astype(np.float32) for k in range(14, 20)}
     played = run(streams(wrong | {k: measured(k) for k in range(20, COUNT)}))
     words, (estimate, _, poses) = texts(played), in_metres(played)
@@ -264,7 +264,7 @@ def test_a_scale_rests_on_so_many_points_and_no_fewer(count: int, found: bool) -
     assert behind.use is RangingUse.FEW
 
 
-def test_depth_that_contradicts_a_known_scale_alike_five_times_is_believed_and_the_way_so_far_doubted() -> None:
+def test_depth_contradicting_the_scale_consistently_replaces_it() -> None:
     scale, memory, told = Scale(0.02), RangingMemory(), []
     for at, factor in enumerate((1.4, 1.4, 0.6, 0.6, 0.6, 0.6, 0.6)):
         told.append(use(given(factor, at), UNITS * mapped(), scale, memory))

@@ -85,7 +85,7 @@ def test_disagreement_is_how_far_apart_two_terms_would_put_the_pose() -> None:
     np.testing.assert_allclose(every[-1], (x - y) / np.hypot(0.2, 0.1), rtol=1e-3)
 
 
-def test_what_single_precision_leaves_of_no_information_is_none() -> None:
+def test_negative_information_by_rounding_counts_as_none() -> None:
     """A wall says nothing of motion along it; rounding may have it say less than nothing."""
     wall = np.diag([-0.2, -0.1, 5e7, 5e6, 9e6, -0.05])
     tracks = Normal(1e6 * np.eye(6), np.full(6, -1e3), 1, NOTHING)

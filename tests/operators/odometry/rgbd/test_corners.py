@@ -90,7 +90,7 @@ def test_a_corner_takes_its_depth_from_the_first_layer_that_has_one() -> None:
     assert not corners.depths_at(PLACES, [], 0.3, 6.0)[1].any()
 
 
-def test_a_corners_point_is_the_mean_of_what_keyframes_measured_and_one_that_contradicts_it_is_dropped() -> None:
+def test_corner_point_averages_keyframe_depths_and_contradicted_ones_are_dropped() -> None:
     """Two keyframes have confirmed the first; the second is new, the third was seen for long."""
     ages, noise = np.array([2, 0, OLDEST]), DepthNoise(0.004, 0.0)
     kept = Corners(PLACES, at(2.0), ages)
@@ -105,7 +105,7 @@ def test_a_corners_point_is_the_mean_of_what_keyframes_measured_and_one_that_con
     np.testing.assert_array_equal(blind.points, kept.points)
 
 
-def test_new_corners_are_those_that_have_depth_and_do_not_move_beside_those_that_are_kept() -> None:
+def test_new_corners_have_depth_are_static_and_apart_from_kept_ones() -> None:
     kept, still = Corners(PLACES[:1], at(2.0)[:1], np.array([4])), Movers.none(K, (240, 320))
     depth = wall(2.0)
     depth[:, 200:] = 0.0

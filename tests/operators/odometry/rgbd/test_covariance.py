@@ -41,7 +41,7 @@ def test_a_pose_that_tracks_and_depth_contradict_is_less_certain() -> None:
     assert sigma2(0.5, 0.9) > 5 * certain
 
 
-def test_what_is_in_dispute_pulls_the_farther_the_wider_the_gate() -> None:
+def test_disputed_pixels_inflate_the_covariance_with_the_gate() -> None:
     assert sigma2(0.5, 0.9, noise=1.0) > 4 * sigma2(0.5, 0.9, noise=0.3)
     assert sigma2(1.0, 1.0, noise=1.0) == sigma2(1.0, 1.0, noise=0.3)
 
@@ -50,7 +50,7 @@ def test_descriptors_that_pair_wrongly_contradict_nothing() -> None:
     assert sigma2(0.3, 0.98, recognised=True) == sigma2(0.9, 0.98, recognised=True) < sigma2(0.3, 0.98)
 
 
-def test_a_pose_is_less_certain_where_tracks_of_its_own_frame_miss() -> None:
+def test_missed_tracks_in_the_same_frame_inflate_the_covariance() -> None:
     """Not where those of earlier frames did, or where none were seen yet."""
     assert sigma2(1.0, 1.0, noise=0.3, missed=0.8) > 10 * sigma2(1.0, 1.0, noise=0.8, missed=0.3)
 
@@ -125,7 +125,7 @@ def test_standing_still_adds_nothing() -> None:
     np.testing.assert_allclose(carried(known, np.eye(4))[0], known.covariance, atol=1e-18)
 
 
-def test_what_sinks_goes_on_sinking() -> None:
+def test_vertical_drift_accumulates_linearly() -> None:
     """Over two steps twice as far, so four times the variance, not two times."""
     known = replace(first_keyframe(), covariance=np.zeros((6, 6)))
     step = se3.exp(np.array([0, 0, 0.2, 0, 0, 0]))

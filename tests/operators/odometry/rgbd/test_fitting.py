@@ -70,7 +70,7 @@ def test_the_larger_surface_stands_still_though_most_corners_are_on_something_ne
     assert where[:, 0].min() > 115
 
 
-def test_most_corners_stand_still_where_what_moves_is_no_farther() -> None:
+def test_majority_of_corners_decides_the_static_scene() -> None:
     points, pixels = seen(corners(110, 130, 310, 1.5, 1), corners(60, 10, 110, 1.5, 2))
     found = followed(points, pixels)
     assert off(found) < 0.01
@@ -101,7 +101,7 @@ def test_few_corners_far_away_contest_nothing(count: int) -> None:
     [(100, 60, (7, 12)), (63.4, 79.4, (9, 7)), (63.6, 79.6, (10, 8)), (-30, 300, (29, 0))],
     ids=["within", "the last pixels of a tile", "the first of the next", "outside"],
 )
-def test_tiles_around_what_moves_are_known_to_move(column: float, row: float, tile: tuple[int, int]) -> None:
+def test_tiles_around_moving_points_are_marked_as_moving(column: float, row: float, tile: tuple[int, int]) -> None:
     still = Movers.none(K, (240, 320))
     assert still.around(np.zeros((0, 3))) is still
     point = np.array([[(column - K[0, 2]) / 260.0, (row - K[1, 2]) / 260.0, 1.0]]) * 1.5

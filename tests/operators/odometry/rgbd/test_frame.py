@@ -23,7 +23,7 @@ def seen(image: NDArray[np.uint8], depth: NDArray[np.float32], last: Watch | Non
     return observe(image, depth, 5, K, K, RgbdOdometryConfig(image_width=300, surface_width=160), last or Watch())
 
 
-def test_images_are_reduced_by_whole_factors_to_no_less_than_asked_for_and_their_calibration_with_them() -> None:
+def test_images_and_calibration_are_reduced_by_whole_factors() -> None:
     """655 columns by two, the odd last ones left out; 640 of depth by four."""
     frame = seen(GRAY, DEPTH)
     assert frame.gray.shape == (243, 327)
@@ -50,7 +50,7 @@ def test_a_colour_image_is_taken_as_grey() -> None:
     np.testing.assert_allclose(seen(red, DEPTH).gray.mean(), 0.299 * GRAY.mean(), rtol=0.02)
 
 
-def test_what_is_black_empty_or_repeated_is_named_and_counts_as_nothing() -> None:
+def test_black_empty_or_repeated_images_are_named_as_flaws() -> None:
     first = seen(GRAY, DEPTH)
     later = GRAY.copy()
     later[0, 0] ^= 1

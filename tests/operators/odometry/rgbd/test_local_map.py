@@ -54,7 +54,7 @@ def test_only_the_newest_keyframes_keep_what_frames_are_compared_with() -> None:
     assert sum(held(k.surface) for k in known.keyframes) < capacity * 1.1 * grid + (RECENT + 4) * whole
 
 
-def test_planes_that_are_made_anew_are_the_same() -> None:
+def test_recomputed_planes_are_identical() -> None:
     surface = keyframe(0).surface
     planes, bordered = surface.bordered_planes, surface.bordered
 
@@ -65,7 +65,7 @@ def test_planes_that_are_made_anew_are_the_same() -> None:
     assert surface.bordered.tobytes() == bordered.tobytes()
 
 
-def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifted_far() -> None:
+def test_keyframes_with_large_possible_drift_are_not_used() -> None:
     """It comes round to the first of them, whose place by the newest is as unsure as the way between them was long."""
     known = LocalMap(20)
     for number in range(4):
@@ -77,7 +77,7 @@ def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifte
     assert sure == [3, 2]
 
 
-def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanwhile() -> None:
+def test_relocalized_camera_does_not_use_keyframes_passed_while_drifting() -> None:
     known = LocalMap(20)
     known.add(replace(keyframe(1), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
     known.add(keyframe(0))
@@ -148,7 +148,7 @@ def test_keyframes_that_rest_on_a_wrong_place_go_back_and_those_before_it_stay()
     assert [float(k.place_variance) for k in known.keyframes[:3]] == [0.0, 0.0, pytest.approx(3e-2)]
 
 
-def test_a_view_is_laid_on_the_newest_keyframe_and_then_on_those_that_see_most_nearly_what_it_sees() -> None:
+def test_nearby_keyframes_are_the_newest_then_those_of_largest_overlap() -> None:
     """Of a wall 2 m away, at steps of 0.2 m; what is more than 1.4 m aside shares too little."""
     known, view = of_segments(*[0] * 14, 1), np.eye(4)
     view[0, 3] = 0.63
@@ -171,7 +171,7 @@ def test_movers_are_detected_by_the_oldest_recent_keyframe_that_shares_the_view(
     assert known.earlier(keyframe(60).T_world_camera, 0) == []
 
 
-def test_a_map_that_is_full_forgets_what_others_make_up_for_and_keeps_the_newest() -> None:
+def test_full_map_drops_redundant_keyframes_and_keeps_the_newest() -> None:
     known = LocalMap(8)
     for number in (0, 4, 8, 12, 13, 14, 15, 16, 17, 18):
         known.add(keyframe(number))

@@ -338,7 +338,7 @@ def after_a_second(
     return odometry.track(*frames[22], int(20e9 / 30) + 1_000_000_000), poses[22]
 
 
-def test_a_track_across_a_gap_gives_way_to_a_place_that_more_speaks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_track_across_a_gap_yields_to_a_better_supported_place(monkeypatch: pytest.MonkeyPatch) -> None:
     result, truth = after_a_second(monkeypatch, (0.03, 0.0, 0.0))
     assert result.status in MEASURED
     assert np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]) < 0.02
@@ -392,7 +392,7 @@ def at_a_wrong_place(state: RgbdState, since: int, T_wrong: NDArray[np.float64])
     return replace(state, motion=wrong, map=known, trials=with_trial(state.trials, trial))
 
 
-def test_a_wrong_place_is_taken_back_when_what_follows_contradicts_it() -> None:
+def test_wrong_relocalization_is_withdrawn_on_contradiction() -> None:
     frames, poses = sequence(25, 3.0)
     odometry = RgbdOdometry(camera())
     for i in range(9):
@@ -487,7 +487,7 @@ def test_a_new_map_begins_elsewhere_and_is_forgotten_when_the_old_one_is_seen_ag
     assert {k.segment for k in odometry.state.map.keyframes} == {0}
 
 
-def test_a_camera_in_a_new_map_counts_as_tracking_after_a_while_though_its_place_is_unknown() -> None:
+def test_camera_in_a_new_map_is_tracking_after_the_give_up_time() -> None:
     _, poses = sequence(25, 3.0)
     odometry = in_the_dark([AROUND @ T for T in poses[:2]], RgbdOdometryConfig(give_up_s=0.2))
     T = AROUND @ poses[2]
@@ -496,7 +496,7 @@ def test_a_camera_in_a_new_map_counts_as_tracking_after_a_while_though_its_place
     assert result.reason.endswith("; a new map, its place in the old one unknown")
 
 
-def test_a_new_map_goes_where_it_belongs_when_a_view_of_it_is_recognised_in_the_old_one(
+def test_new_map_is_aligned_when_a_view_is_recognised_in_the_old_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """For three frames nothing is recognised, so a new map begins where the camera is believed to be, a metre off."""
@@ -532,7 +532,7 @@ def test_a_keyframe_is_made_whenever_the_view_has_changed_by_a_tenth_of_a_radian
     assert keyframes_of(turning(0.0)) == [0]
 
 
-def test_a_view_with_depth_takes_the_place_of_one_that_has_little_and_not_the_other_way_round() -> None:
+def test_view_with_depth_replaces_a_keyframe_with_little_only() -> None:
     frames, _ = sequence(25)
     narrow = [(g, np.where(np.arange(SIZE[0]) > 0.3 * SIZE[0], np.float32(0), d)) for g, d in frames]
     assert keyframes_of([narrow[0], *frames[1:4]])[:2] == [0, 1]
@@ -541,12 +541,12 @@ def test_a_view_with_depth_takes_the_place_of_one_that_has_little_and_not_the_ot
     assert keyframes_of([*turned[:1], *poor[1:4], *turned[4:6]]) == [0, 4]
 
 
-def test_parameters_are_by_default_what_settings_are() -> None:
+def test_default_parameters_equal_the_default_settings() -> None:
     assert VisualOdometry()._config() == RgbdOdometryConfig()
 
 
 @pytest.mark.long
-def test_a_view_that_is_found_again_in_a_new_map_apart_says_nothing_of_the_old_one() -> None:
+def test_relocalization_in_a_separate_map_leaves_the_old_map_lost() -> None:
     frames, poses = sequence(60, 1.5)
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
     shown = [*poses[:20], *poses[45:48]]
@@ -576,7 +576,7 @@ def mover_sequence(count: int) -> Sequence:
 
 
 @pytest.mark.long
-def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
+def test_moving_object_does_not_disturb_the_pose() -> None:
     frames, poses = mover_sequence(25)
     results = follow(frames, rate=10.0)
     steps = [
@@ -588,7 +588,7 @@ def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
 
 
 @pytest.mark.long
-def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keyframes_exclude_moving_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = mover_sequence(25)
     odometry, fits = RgbdOdometry(camera()), []
     refine = Fitter.refine
@@ -749,7 +749,7 @@ def test_repeated_calibration_is_the_same_and_another_is_refused() -> None:
     assert_one_calibration(VisualOdometry, given, ["image_info", "depth_info"], "depth", other, 5)
 
 
-def test_a_clock_that_begins_anew_begins_a_new_path() -> None:
+def test_clock_reset_starts_a_new_trajectory() -> None:
     operator, calibration = VisualOdometry(), (info("color", K_COLOR), info("depth", K_DEPTH))
     operator.setup()
     *first, last = zip(*messages(13)[:2], strict=True)

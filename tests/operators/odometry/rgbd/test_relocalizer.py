@@ -131,7 +131,7 @@ def test_a_view_that_contradicts_the_map_must_look_the_more_like_it() -> None:
     assert Evidence(3507, overlap=0.52, agreement=0.88, likeness=0.57, beside=0.57, contrary=0.03).certain
 
 
-def test_what_stands_where_the_map_saw_past_it_is_contrary_and_what_hides_something_is_not() -> None:
+def test_object_in_free_space_of_the_map_is_contrary_and_occlusion_is_not() -> None:
     """A crate, 1 m before a third of the wall: in the view or in the map alone, in both, in none."""
     wall, crate = pattern(1), np.full((HEIGHT, WIDTH), WALL, np.float32)
     crate[:, : WIDTH // 3] = WALL - 1.0

@@ -95,7 +95,7 @@ def test_a_surface_seen_at_a_grazing_angle_has_no_direction(degrees: float, seen
     assert faced.all() if seen else not faced.any()
 
 
-def test_what_is_no_depth_or_out_of_range_is_no_return() -> None:
+def test_invalid_or_out_of_range_depth_is_no_return() -> None:
     depth = wall()
     depth[:20], depth[20:40], depth[40:60], depth[60:80] = np.nan, 0.2, 6.1, 0.0
     surface = Surface.from_depth(depth, K, 0.3, 6.0, 2)

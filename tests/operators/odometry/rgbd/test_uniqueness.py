@@ -114,7 +114,7 @@ def test_a_corridor_whose_pattern_does_not_repeat_is_evidence() -> None:
     assert taken_for(groove, 6.0, 0.1, 0.1)
 
 
-def test_a_plane_of_which_too_little_is_seen_for_its_pattern_to_repeat_is_no_evidence() -> None:
+def test_narrow_strip_of_a_plane_is_no_evidence() -> None:
     def strip(X: Array, Y: Array) -> Array:
         return np.where(np.abs(Y) < 0.2, 2.0, 1e3)  # which is no return
 
@@ -122,7 +122,7 @@ def test_a_plane_of_which_too_little_is_seen_for_its_pattern_to_repeat_is_no_evi
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_a_wall_that_looks_like_another_elsewhere_is_no_evidence_where_the_one_beside_it_does_not(same: bool) -> None:
+def test_lookalike_wall_is_no_evidence_where_its_surroundings_differ(same: bool) -> None:
     there = spots(6.0)
     here = there.copy()
     if not same:

@@ -149,7 +149,7 @@ def test_no_more_pairs_are_kept_than_asked_for_and_the_first_and_newest_stay() -
     assert stamps[-5:] == [15, 16, 17, 18, 19]
 
 
-def test_a_segment_is_numbered_anew_and_one_that_was_found_again_is_gone_on_with() -> None:
+def test_unknown_place_starts_a_segment_and_relocalization_continues_one() -> None:
     """The place of the second is unknown while the camera is found in the first."""
     known = StereoMap(tuple(kept(np.eye(4), number, segment=number) for number in range(3)))
     joined = known.placed(known.keyframes[0], np.eye(4))

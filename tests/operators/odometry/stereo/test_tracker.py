@@ -15,10 +15,11 @@ from operator_runs import assert_resumes_alike, largest_errors
 
 from dataflow.messages import CameraInfo, Image
 from dataflow.messages.geometry import invert, transform_points
+from operators.estimation.bundle import Sightings
 from operators.geometry import se3
 from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
-from operators.odometry.stereo.adjustment import Offset, Past, Sightings, adjust
+from operators.odometry.stereo.adjustment import Offset, Past, adjust, fitting
 from operators.odometry.stereo.odometry import rig_of
 from operators.odometry.stereo.relocalizer import RelocalizedPose, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
@@ -98,7 +99,7 @@ def test_no_part_of_the_window_holds_the_length_that_a_wrong_offset_gave_it() ->
     assert np.ptp(lengths) < 0.003
 
 
-def test_a_window_counts_for_what_it_shows_of_the_offset() -> None:
+def test_window_informs_the_offset_by_its_motion() -> None:
     """A camera that stands still cannot tell near points of one offset from farther ones of another."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-5, 5, 60), rng.uniform(-2, 2, 60), rng.uniform(8, 40, 60)])
@@ -158,7 +159,7 @@ def test_points_that_are_gone_still_hold_the_window() -> None:
     assert off["held"] < 0.1
 
 
-def test_what_is_known_of_poses_stays_when_the_first_of_them_goes() -> None:
+def test_marginalizing_the_first_pose_keeps_the_information_on_the_others() -> None:
     """The last poses are as sure of each other as with the first one beside them."""
     rng = np.random.default_rng(2)
     poses = np.array(driving(4))
@@ -184,19 +185,18 @@ def test_a_point_is_seen_where_the_rig_projects_it_and_found_again_from_there() 
 
 
 def test_sightings_are_kept_by_point_and_go_with_their_frame() -> None:
-    two = (
-        Sightings.none().also(0, np.array([0, 2]), np.full((2, 3), 1.0)).also(1, np.array([1, 2]), np.full((2, 3), 2.0))
-    )
+    one = Sightings.none(3).also(0, np.array([0, 2]), np.full((2, 3), 1.0))
+    two = one.also(1, np.array([1, 2]), np.full((2, 3), 2.0))
     some = two.of_points(np.array([2, 0]))
     assert (some.frames.tolist(), some.points.tolist()) == ([0, 0, 1], [1, 0, 0])
     assert some.pixels[:, 0].tolist() == [1.0, 1.0, 2.0]
     later = two.without_first()
     assert (later.frames.tolist(), later.points.tolist(), later.pixels[:, 0].tolist()) == ([0, 0], [1, 2], [2.0, 2.0])
     squared = np.array([3.0, 14.0, 14.0, 9.0])  # of points 0, 2, 1, 2
-    assert two.fitting(squared, 4).tolist() == [True, False, True, False]
+    assert fitting(two, squared, 4).tolist() == [True, False, True, False]
 
 
-def test_what_is_known_of_poses_is_the_same_about_others_nearby() -> None:
+def test_pose_information_relinearizes_at_nearby_poses() -> None:
     """The gradient of a sum of squares at another place, to first order; a pose that is new is free."""
     poses, rng = np.array(driving(2)), np.random.default_rng(4)
     H = rng.normal(size=(13, 13))
@@ -281,7 +281,7 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
         assert np.linalg.norm((k.T_world_camera - truth[k.stamp])[:3, 3]) < 0.1
 
 
-def test_a_view_is_found_among_pairs_that_were_kept_and_believed_where_they_show_the_same() -> None:
+def test_view_is_relocalized_among_kept_pairs_that_agree() -> None:
     pairs, poses = sequence(25)
 
     def kept(k: int, T: Matrix, segment: int = 0) -> StereoKeyframe:

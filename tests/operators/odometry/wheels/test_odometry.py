@@ -153,7 +153,7 @@ def test_wheels_that_speed_up_faster_than_the_robot_slip_and_are_doubted() -> No
     assert widths[1] > 0.5 * error > 3 * widths[0]
 
 
-def test_counts_that_begin_anew_leave_the_motion_as_it_was() -> None:
+def test_encoder_count_reset_keeps_the_motion() -> None:
     path = steady(0.5, 0, 4.0)
     path[40:] -= path[40] - 50.0
     played = driven(ticks(path))
@@ -173,7 +173,7 @@ def test_after_a_gap_the_end_is_known_less() -> None:
 
 
 @pytest.mark.parametrize("kind", ["positions", "velocities"])
-def test_joints_give_what_ticks_give(kind: str) -> None:
+def test_joint_states_and_ticks_give_equal_odometry(kind: str) -> None:
     rolled = steady(0.5, 0.3, 3.0)
     values = rolled / RADIUS if kind == "positions" else np.repeat([[0.5 - 0.06, 0.5 + 0.06]], len(rolled), 0) / RADIUS
     joints = [
@@ -219,7 +219,7 @@ def test_each_side_is_the_mean_of_its_wheels_and_messages_know_their_own_scale()
         ({"left": ("right",)}, "wheel 'right' is on both sides"),
     ],
 )
-def test_what_is_missing_is_named(params: dict[str, Any], text: str) -> None:
+def test_missing_or_unknown_settings_are_named(params: dict[str, Any], text: str) -> None:
     with pytest.raises(OperatorFailure, match=text):
         driven(ticks(steady(0.5, 0, 0.2)), **params)
 

@@ -124,7 +124,7 @@ def looks(graphs: list[SceneGraph], *likely: str) -> list[Classification]:
     ]  # fmt: skip
 
 
-def test_what_a_posture_looks_like_counts_beside_motion_unless_it_is_switched_off() -> None:
+def test_posture_counts_beside_motion_unless_switched_off() -> None:
     mug: Box = 4, "mug", (0.45, 0.2, 0.75), (0.09, 0.09, 0.1)
     table: Box = 6, "table", (0.7, 0.0, 0.0), (0.6, 1.2, 0.75)
     graphs = course(4, lambda t: [person(0.0, 0.0), mug, table])
@@ -146,7 +146,7 @@ def test_looks_of_another_time_change_nothing() -> None:
     assert play(Recognizer(), given).digests() == play(Recognizer(), {"nodes": graphs}).digests()
 
 
-def test_a_posture_that_speaks_against_motion_does_not_outweigh_it_at_once() -> None:
+def test_contradicting_posture_does_not_outweigh_motion_at_once() -> None:
     graphs = course(6, lambda t: [person(0.65 * t, 0.0, length=0.8)])
     names = ["walking"] * (len(graphs) - 1) + ["standing"]
     found = play(Recognizer(), {"nodes": graphs, "postures": looks(graphs, *names)})["activities"]
@@ -175,7 +175,7 @@ def test_activities_repeat_and_a_restored_recogniser_goes_on() -> None:
     assert_repeats(Recognizer, [{"nodes": g, "postures": p} for g, p in zip(graphs, seen, strict=True)], 11)
 
 
-def test_an_agent_that_was_lost_begins_anew_and_an_empty_graph_is_no_error() -> None:
+def test_lost_agent_restarts_its_activity_and_an_empty_graph_is_valid() -> None:
     graphs = [nodes(0.0, [person(0, 0)]), nodes(0.25, []), nodes(0.5, [person(5, 5)])]
     messages = play(Recognizer(), {"nodes": graphs})["activities"]
     assert [m.count for m in messages] == [1, 0, 1]

@@ -33,7 +33,7 @@ def episode(seconds: float = 12.0) -> Episode:
     )  # fmt: skip
 
 
-def test_true_moments_are_the_episode_without_what_does_not_matter() -> None:
+def test_true_moments_omit_irrelevant_objects() -> None:
     made = episode()
     moments = list(true_moments(made, 2))
     assert [m.row for m in moments] == list(range(0, 96, 2))
@@ -41,7 +41,7 @@ def test_true_moments_are_the_episode_without_what_does_not_matter() -> None:
     np.testing.assert_allclose(moments[5].bodies[0].center, made.boxes[10, 0, :3])
 
 
-def test_a_seed_decides_what_a_tracker_makes_of_it() -> None:
+def test_simulated_tracks_are_determined_by_the_seed() -> None:
     first, again, other = (tracked_sequences(episode(), 2, np.random.default_rng(seed)) for seed in (3, 3, 4))
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a.features, b.features)
@@ -76,7 +76,7 @@ def test_features_are_finite_and_labels_trail_by_a_quarter_of_a_second() -> None
     assert right[46].tolist() == [True, True, False]
 
 
-def test_an_episode_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_episode_survives_its_file(tmp_path: Path) -> None:
     made = episode()
     made.write(tmp_path / "made.npz")
     read = Episode.read(tmp_path / "made.npz")

@@ -130,7 +130,7 @@ def test_files_that_are_no_learned_objects_or_of_another_detector_are_refused(le
         play(LearnedDetector(objects=[str(strange)]), {"image": [image(scenery(0, sign=True)[0])]})
 
 
-def test_a_learned_object_is_read_as_it_was_written(learned: Path, tmp_path: Path) -> None:
+def test_learned_object_survives_its_file(learned: Path, tmp_path: Path) -> None:
     known = LearnedObject.read(learned)
     known.write(tmp_path / "copy.npz")
     copy = LearnedObject.read(tmp_path / "copy.npz")
@@ -138,7 +138,7 @@ def test_a_learned_object_is_read_as_it_was_written(learned: Path, tmp_path: Pat
     np.testing.assert_array_equal(copy.direction, known.direction)
 
 
-def test_what_varies_everywhere_does_not_tell_an_object() -> None:
+def test_uninformative_feature_axis_gets_little_weight() -> None:
     """The first axis differs most but at random; the second tells."""
     rng = np.random.default_rng(0)
 

@@ -20,7 +20,7 @@ def trunk() -> Trunk:
     return Trunk(DETECTOR, inner_maps(DETECTOR))
 
 
-def test_inner_maps_come_beside_outputs_that_stay_what_they_are(trunk: Trunk) -> None:
+def test_trunk_maps_accompany_unchanged_outputs(trunk: Trunk) -> None:
     glance = trunk.look(PIXELS)
     assert [m.shape[1:] for m in glance.trunk] == [(72, 96), (36, 48), (18, 24)]
     network = open_network(DETECTOR, "detector")
@@ -39,7 +39,7 @@ def test_proposals_overlap_little_and_fall_in_score(trunk: Trunk) -> None:
     assert proposed.shape[1] == 4
 
 
-def test_a_box_is_described_by_what_is_in_it(trunk: Trunk) -> None:
+def test_box_descriptor_pools_the_features_inside_it(trunk: Trunk) -> None:
     """A glance whose maps are 1 on the left half and 2 on the right, in one channel."""
     glance = trunk.look(PIXELS)
     for each in glance.trunk:

@@ -106,7 +106,7 @@ def test_standing_and_sitting_bodies_are_not_confused(turn: float) -> None:
     assert upright[0] > 0.5 > 2 * upright[1]
 
 
-def test_legs_apart_speak_for_walking() -> None:
+def test_legs_apart_raise_the_probability_of_walking() -> None:
     walking = [judged(look(parts, turn=np.pi / 2)) for parts in (STANDING, STRIDING)]
     column = walking[0].class_names.index("walking")
     found = [float(m.probabilities[0, column]) for m in walking if m.probabilities is not None]

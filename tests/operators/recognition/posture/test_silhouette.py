@@ -37,7 +37,7 @@ def test_a_body_fills_the_cells_that_it_is_seen_in() -> None:
     assert abs((columns.max() + columns.min() + 1) / 2 - SIDE / 2) <= 1
 
 
-def test_a_hand_stretched_to_the_right_is_to_the_right_and_nearer_where_it_is_nearer() -> None:
+def test_hand_stretched_to_the_right_appears_right_and_nearer() -> None:
     hand = wall(2.7, (-0.6, -0.4), (1.0, 1.1))  # y points left
     body, near, _ = made(np.concatenate([wall(3.0, (-0.2, 0.2), (0.0, 1.7)), hand]))
     assert body[:, SIDE // 2 + 12 :].any()
@@ -45,7 +45,7 @@ def test_a_hand_stretched_to_the_right_is_to_the_right_and_nearer_where_it_is_ne
     np.testing.assert_allclose(near[:, SIDE // 2 + 12 :][body[:, SIDE // 2 + 12 :] > 0], 0.3 / 0.6, atol=1e-5)
 
 
-def test_what_stands_before_and_behind_differs_from_what_is_not_seen() -> None:
+def test_silhouette_distinguishes_front_behind_and_unseen() -> None:
     table = wall(2.0, (-0.6, 0.6), (0.0, 0.7))
     room = wall(5.0, (0.5, 1.5), (0.0, 2.0))
     _, _, others = made(wall(3.0, (-0.2, 0.2), (0.8, 1.7)), np.concatenate([table, room]))

@@ -94,14 +94,14 @@ def test_things_stand_on_surfaces_by_their_height_and_extent() -> None:
 
 
 @pytest.mark.parametrize(("below", "lies"), [(0.02, True), (0.05, False)])
-def test_what_is_flat_lies_on_a_plane_that_is_a_little_off(below: float, lies: bool) -> None:
+def test_flat_object_lies_on_a_slightly_offset_plane(below: float, lies: bool) -> None:
     top = 0.75
     magazine: Thing = (8, "book", (2, 0.1, top - below), (0.2, 0.3, 0.01))
     found = first(TABLE, TOP, magazine)
     assert {o for s, p, o in found if s == 8 and p == "on"} == ({1, -11} if lies else set())
 
 
-def test_a_table_top_without_a_table_carries_what_stands_on_it() -> None:
+def test_tabletop_without_a_table_carries_its_objects() -> None:
     found = first(MUG, TOP)
     assert found[2, "on", -11] > 0.6
     assert not any(s == -11 for s, _, _ in found)
@@ -182,7 +182,7 @@ def test_a_person_walks_to_a_chair_and_sits_down() -> None:
     assert (9, "sitting_on", 3) in relations(played["graph"][-1])
 
 
-def test_what_a_hand_has_is_held() -> None:
+def test_object_in_a_hand_is_held() -> None:
     cup: Thing = (2, "mug", (1.65, -2, 1.2), (0.1, 0.08, 0.1))
     found = relations(built([[TABLE, cup, person(1.4, -2)]] * 6)["graph"][-1])
     assert (9, "holding", 2) in found
@@ -244,7 +244,7 @@ def test_classes_without_an_entry_in_the_label_space_are_related_and_named_once(
     assert "the label space coco has no entry for 'zorb', 'dax'" in record.getMessage()
 
 
-def test_with_the_classes_of_coco_things_are_in_a_refrigerator_and_persons_sit_on_couches() -> None:
+def test_coco_classes_support_in_refrigerator_and_sitting_on_couch() -> None:
     refrigerator: Thing = (1, "refrigerator", (0, 0, 0.9), (0.6, 0.6, 1.8))
     bottle: Thing = (2, "bottle", (0, 0, 1.0), (0.08, 0.08, 0.3))
     couch: Thing = (3, "couch", (3, 0.1, 0.4), (0.9, 1.8, 0.8))
@@ -261,7 +261,7 @@ def test_nodes_keep_the_tracks_that_are_theirs() -> None:
     assert held == {"mug 2": (5, 9), "table 1": (4,)}
 
 
-def test_graphs_repeat_and_a_restored_builder_goes_on() -> None:
+def test_restored_builder_continues_identically() -> None:
     rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
     assert_repeats(Builder, [(room(k, things), robot(k)) for k, things in enumerate(rooms)], 10)
 
@@ -278,7 +278,7 @@ def test_gap_is_symmetric_and_no_share_exceeds_one(x: float, y: float, size: flo
     assert gap(first, second) == 0 or footprint_share(first, second) == 0
 
 
-def test_hysteresis_forgets_what_is_no_more() -> None:
+def test_hysteresis_forgets_removed_objects() -> None:
     held = Hysteresis(0.5, 0.25, 0.4)
     held.update(0, {(1, "on", 2): 1.0})
     held.forget({2})
@@ -293,7 +293,7 @@ def test_orientation_turns_a_footprint() -> None:
 
 
 @pytest.mark.parametrize(("moving", "said"), [(0.05, "resting"), (0.5, "unknown"), (0.95, "driving")])
-def test_a_vehicle_that_is_known_to_stand_rests_though_its_box_moves(moving: float, said: str) -> None:
+def test_vehicle_known_to_stand_rests_though_its_box_moves(moving: float, said: str) -> None:
     seen = [room(k, [(2, "car", (8 + 0.3 * k, 3, 0.7), (4, 1.8, 1.5)), TABLE]) for k in range(8)]
     graph, act = driven(seen, moving)
     assert (doing(act), graph) == (said, np.float32(moving))
@@ -319,7 +319,7 @@ def driven(seen: Sequence[SceneGraph], moving: float, ago: int = 0) -> tuple[np.
 
 
 @pytest.mark.parametrize(("moving", "speed"), [(0.05, 0.0), (0.5, 10.0), (np.nan, 10.0), (0.95, 10.0)])
-def test_an_agent_has_the_velocity_of_its_centre_unless_it_is_known_to_stand(moving: float, speed: float) -> None:
+def test_agent_has_the_velocity_of_its_centre_unless_at_standstill(moving: float, speed: float) -> None:
     graph = LayeredGraph(GraphSettings())
     for k in range(8):
         center, size = np.array([40 + 2.0 * k, 3, 0.7]), np.array([4, 1.8, 1.5])

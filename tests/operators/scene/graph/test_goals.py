@@ -48,7 +48,7 @@ def test_goal_of_a_path_is_symmetric_in_left_and_right(side: int) -> None:
     assert max(found, key=lambda i: found[i]) == 2
 
 
-def test_what_newly_comes_into_the_map_is_judged_by_the_path_before() -> None:
+def test_goal_added_later_is_judged_by_the_earlier_path() -> None:
     """Doors left and right, equally far from who has come from the left: that to the left was left behind."""
     left, right = thing(1, "door", -1, 0, size=1), thing(2, "door", 3, 0, size=1)
     inference, walk = GoalInference(), [0.2 * k for k in range(6)]
@@ -70,9 +70,7 @@ def test_jitter_of_a_still_box_leaves_goals_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("space", "near", "far", "goal"), [("simulator", "table", "door", 1), ("coco", "dining table", "couch", -1)]
 )
-def test_a_person_heads_for_what_it_walks_to_where_the_label_space_has_goals(
-    space: str, near: str, far: str, goal: int
-) -> None:
+def test_person_heads_for_the_goal_it_walks_to(space: str, near: str, far: str, goal: int) -> None:
     own = LabelSpace.read(Path(labels_file(space))).roles
     table = Body(1, near, np.array([1.0, 0.0, 0.4]), np.array([0.6, 1.6, 0.8]), 0.0, np.zeros(3), own(near))
     other = Body(2, far, np.array([-3.0, 0.0, 0.8]), np.ones(3), 0.0, np.zeros(3), own(far))

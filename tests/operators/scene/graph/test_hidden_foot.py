@@ -50,6 +50,6 @@ def test_the_back_of_a_chair_that_shows_behind_a_table_is_of_a_chair_on_the_floo
         ("plant", 0.74, 0.86, "simulator"),  # half of one
     ],
 )
-def test_what_is_on_a_table_stays_there(label: str, bottom: float, top: float, space: str) -> None:
+def test_object_on_a_table_keeps_its_carrier(label: str, bottom: float, top: float, space: str) -> None:
     assert {("on", TABLE), ("on", TOP)} <= relations(label, bottom, top, space)
     assert ("on", FLOOR) not in relations(label, bottom, top, space)

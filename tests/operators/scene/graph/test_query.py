@@ -56,7 +56,7 @@ def graph(stamp: int = 1_000_000_000) -> SceneGraph:
         ("person on table", []),
     ],
 )
-def test_a_question_finds_what_fits(question: str, ids: list[int]) -> None:
+def test_query_finds_the_matching_nodes(question: str, ids: list[int]) -> None:
     made = graph()
     assert [int(made.ids[m.node]) for m in ask(made, question)] == ids
 
@@ -88,7 +88,7 @@ def test_relations_of_several_words_are_understood() -> None:
         ("", "the question is empty"),
     ],
 )
-def test_what_is_not_understood_is_named(question: str, words: str) -> None:
+def test_unparsable_query_is_refused_by_name(question: str, words: str) -> None:
     with pytest.raises(QueryError, match=words):
         ask(graph(), question)
 
@@ -134,7 +134,7 @@ def test_a_class_of_the_very_name_comes_before_one_that_is_called_so_too() -> No
     assert sorted(int(made.ids[m.node]) for m in ask(made, "dining table", COCO)) == [-2, 1, 5]
 
 
-def test_what_is_proposed_is_a_relation_and_no_relation_is_called_something_else() -> None:
+def test_suggested_relations_exist_and_shadow_no_relation() -> None:
     assert set(_MEANT.values()) <= set(_PHRASES)
     assert not set(_MEANT) & set(_PHRASES)
 
@@ -172,7 +172,7 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_the_command_knows_the_label_space_of_the_graph_that_was_recorded(tmp_path: Path, there: bool) -> None:
+def test_query_command_uses_the_label_space_of_the_recorded_graph(tmp_path: Path, there: bool) -> None:
     own = tmp_path / "own.yaml"
     own.write_text("label_space: own\nunit: m\nlabels:\n  mug: {aliases: [teacup]}\n")
     made = load_graph(GRAPHS / "perception_rgbd.yaml", settings=[f"labels={own}"])
@@ -259,7 +259,7 @@ def colors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def test_any_text_ranks_the_nodes_by_what_it_means(tmp_path: Path, colors: Path) -> None:
+def test_free_text_ranks_the_nodes_by_meaning(tmp_path: Path, colors: Path) -> None:
     file = embedded(tmp_path)
     _, out = asked(str(file), "--query", "something red to drink from", "--json")
     matches = [(m["id"], m["score"]) for m in json.loads(out[out.index("{") :])["matches"]]

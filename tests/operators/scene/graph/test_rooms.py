@@ -79,7 +79,7 @@ def test_rooms_are_nodes_with_area_and_box_joined_by_doors_within_a_building() -
     np.testing.assert_allclose(graph.sizes[ids.index(RIGHT)][:2], [4.0, 4.0])
 
 
-def test_what_is_far_from_all_rooms_is_in_none() -> None:
+def test_object_far_from_all_rooms_is_in_none() -> None:
     graph = last(built([[TABLE, (5, "chair", (2.0, 6.0, 0.5), (0.5, 0.5, 1.0))]]))
     assert room_of(graph, 5) == []
     assert room_of(graph, 1) == ["room 1"]
@@ -113,7 +113,7 @@ def test_questions_reports_and_exports_know_the_rooms() -> None:
     assert (layers["building"], layers["room 1"], layers["table 1"]) == (5, 4, 2)
 
 
-def test_without_rooms_the_graph_is_as_it_was() -> None:
+def test_graph_without_rooms_is_unchanged() -> None:
     graph = last(play(Builder(), {"nodes": [scene_graph([TABLE, CHAIR], stamp=STEP)]}))
     assert graph.areas is None
     assert {"room", "floor"} <= set(graph.names())

@@ -65,7 +65,7 @@ def test_a_wall_that_shows_through_a_chairs_back_is_not_the_chair(slats: int) ->
     assert set(seen.points[found.points, 2]) == {2.0}
 
 
-def test_a_cup_before_what_a_box_is_around_is_not_the_box_thing() -> None:
+def test_cup_in_front_of_a_boxed_object_is_excluded_from_it() -> None:
     seen = behind_slats(4)
     seen.points[:] *= 3.0 / seen.points[:, 2:]
     cup = (np.abs(seen.pixels - [320, 240]) <= 15).all(axis=1)
@@ -74,7 +74,7 @@ def test_a_cup_before_what_a_box_is_around_is_not_the_box_thing() -> None:
     assert set(seen.points[found.points, 2]) == {3.0}
 
 
-def test_columns_of_pixels_hold_all_points_between_two_places_and_none_that_is_a_pixel_away() -> None:
+def test_pixel_columns_return_the_points_between_two_places() -> None:
     rng = np.random.default_rng(3)
     u, v = rng.uniform(0, 640, 4000), rng.uniform(0, 480, 4000)
     inside = rng.random(4000) < 0.8

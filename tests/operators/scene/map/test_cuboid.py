@@ -40,7 +40,7 @@ def spine(box: Box) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.7], ids=["exact", "noisy"])
-def test_a_book_of_which_the_spine_is_seen_gets_its_depth_and_stays_apart_from_its_neighbour(noise: float) -> None:
+def test_book_seen_by_its_spine_is_completed_without_overlapping_its_neighbour(noise: float) -> None:
     beside: Box = (BOOK[0] + [0, 0.045, 0], BOOK[1], BOOK[2])
     found = []
     for box in (BOOK, beside):
@@ -85,7 +85,7 @@ def test_leaves_inside_their_box_do_not_push_it_away_from_the_viewer() -> None:
     assert abs(center[0] - 2.5) < 0.02
 
 
-def test_points_that_stray_by_the_noise_of_their_ranges_do_not_draw_a_box_towards_the_viewer() -> None:
+def test_range_noise_does_not_pull_the_box_towards_the_viewer() -> None:
     far: Box = (np.array([4.7, 0.1, 1.0]), np.array([0.16, 0.04, 0.23]), 0.0)
     points = np.concatenate([spine(far)] * 3)
     points[:, 0] += np.random.default_rng(7).normal(0, 0.0012 * 4.4**2, len(points))
@@ -97,7 +97,7 @@ def test_points_that_stray_by_the_noise_of_their_ranges_do_not_draw_a_box_toward
     assert abs(single[0] - 4.7) < 0.015 < 4.7 - accumulated[0]
 
 
-def test_a_few_points_of_something_before_a_thing_do_not_draw_its_box_towards_the_viewer() -> None:
+def test_occluder_points_do_not_pull_the_box_towards_the_viewer() -> None:
     """Raw points of a far bottle, of which one in fifteen is of what hides a brink of it."""
     bottle: Box = (np.array([4.5, 0.0, 1.0]), np.array([0.07, 0.07, 0.25]), 0.0)
     rng = np.random.default_rng(5)
@@ -133,7 +133,7 @@ def test_fit_reveals_the_view_of_another_thing() -> None:
 
 
 @pytest.mark.parametrize("before", [None, 0], ids=["open", "settled before the room's heading was known"])
-def test_a_shelf_lies_along_the_room_where_views_of_what_is_beside_it_would_turn_it(before: int | None) -> None:
+def test_shelf_is_aligned_with_the_room_despite_views_of_its_neighbour(before: int | None) -> None:
     """Boxes in the image of a shelf and a part of its neighbour, which some views show as one."""
     shelf: Box = (np.array([2.8, 0.0, 0.7]), np.array([0.31, 1.0, 1.4]), 0.0)
     askew: Box = (shelf[0], np.array([0.31, 1.0, 1.4]), 0.25)

@@ -72,7 +72,7 @@ def test_equal_maps_are_equal_files_and_are_read_as_they_were_written(
     assert (tmp_path / "copy.npz").read_bytes() == saved.read_bytes()
 
 
-def test_what_moves_by_itself_is_not_taken_over(shown: list[View], saved: Path) -> None:
+def test_movable_objects_are_not_loaded_from_the_map_file(shown: list[View], saved: Path) -> None:
     assert set(last(mapped(shown)).labels()) == {"box"}
     boxes_move = Path(__file__).parents[1] / "label_spaces" / "boxes_move.yaml"
     assert last(mapped(shown[:1], map_file=str(saved), labels=str(boxes_move))).count == 0

@@ -36,7 +36,7 @@ def entry(id: int, y: float, class_id: int = 0) -> MapObject:
         (1, 0.4, 20, True), (2, 0.3, 0, False), (2, 0.45, 0, True), (2, 0.45, 4, False),
     ],
 )  # fmt: skip
-def test_entries_that_share_their_place_are_one_unless_views_show_them_beside_each_other(
+def test_overlapping_entries_are_merged_unless_seen_side_by_side(
     classes: int, shared: float, beside: int, one: bool
 ) -> None:
     a, b = entry(1, 0.0), entry(2, 0.04 * (1 - shared), classes - 1)
@@ -54,7 +54,7 @@ def test_entries_that_are_one_are_among_those_that_may_be() -> None:
     assert not may.all()
 
 
-def test_what_is_within_reach_of_a_box_is_compared_with_it() -> None:
+def test_observations_within_reach_of_a_box_are_compared() -> None:
     rng = np.random.default_rng(4)
     rows = np.column_stack([rng.uniform(0, 2, (40, 3)), rng.uniform(0.05, 1, (40, 3)), rng.uniform(-3, 3, 40)])
     voxels = VoxelSet.of_each([place + np.zeros((1, 3)) for place in rng.uniform(0, 2, (50, 3))], 0.03)

@@ -80,7 +80,7 @@ def test_a_car_in_front_that_drives_is_seen_to(own: float) -> None:
     assert judged(lambda t: ((9 + 2.5 * t, 0, 1), (4.5, 1.8, 1.5)), own, 0).moving > 0.9
 
 
-def test_a_truck_that_overtakes_drives_though_its_side_looks_alike_and_its_rear_is_out_of_sight() -> None:
+def test_overtaking_truck_with_uniform_side_is_moving() -> None:
     def place(t: float) -> Block:
         return ((4 + 6 * t, *TRUCK[0][1:]), TRUCK[1])
 

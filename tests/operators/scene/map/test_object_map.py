@@ -118,7 +118,7 @@ def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None
         (SizePrior((0.5, 0.5, 0.8), (0.3, 0.3, 0.3)), -0.28, 0.8, False),  # of a class that does not stand there
     ],
 )
-def test_what_stands_on_the_floor_reaches_down_to_it(
+def test_object_near_the_floor_is_extended_down_to_it(
     prior: SizePrior, bottom: float, height: float, reaches_down: bool
 ) -> None:
     known = mapping({BOX: (prior,)}, movers=[BOX] if prior is PERSON else [])
@@ -141,7 +141,7 @@ def test_a_person_whom_the_image_cuts_off_keeps_the_size_and_goes_on(along: floa
     assert [size[2], *center[1:]] == pytest.approx([1.4, along, 0.3], abs=0.15)
 
 
-def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
+def test_part_never_seen_beside_its_whole_is_no_separate_object() -> None:
     """The foot of a thing, detected as something else where its top is hidden."""
     foot: Solid = ((2.0, 0.0, 0.07), (0.12, 0.12, 0.06))
     scenes: list[list[tuple[Solid, int]]] = [[(THING, BOX)]] * 6 + [[(foot, MUG)]] * 4 + [[(THING, BOX)]] * 2
@@ -248,7 +248,7 @@ def test_a_snapshot_is_taken_up_also_from_before_something_was_counted(lacks: Se
     assert known.objects[1].beside[2] > 0
 
 
-def test_what_was_seen_beside_a_thing_that_is_no_more_is_forgotten() -> None:
+def test_evidence_beside_a_removed_object_is_forgotten() -> None:
     both = [[(THING, BOX), (BESIDE, BOX)]] * 3
     assert sum(len(o.beside) for o in after(both).objects.values()) == 2
     known = after([*both[:2], *[[(THING, BOX)]] * 10])
@@ -268,7 +268,7 @@ def test_evidence_is_independent_of_the_rate_of_images(rate: int) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "given"), [(0.1, 0), (0.3, 1)])
-def test_what_images_in_a_flash_show_is_not_yet_there(seconds: float, given: int) -> None:
+def test_objects_seen_for_too_short_a_time_are_unconfirmed(seconds: float, given: int) -> None:
     known = mapping()
     for k in range(4):
         stamp = SECOND + round(k * seconds / 3 * SECOND)

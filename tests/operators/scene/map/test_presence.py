@@ -38,7 +38,7 @@ def view(*surfaces: NDArray[np.float64]) -> RangeView:
 
 
 @pytest.mark.parametrize(("behind", "left"), [(0.12, True), (0.03, False)])
-def test_a_ball_has_left_its_place_where_what_is_not_far_behind_it_shows(behind: float, left: bool) -> None:
+def test_ball_has_left_where_a_surface_close_behind_it_is_visible(behind: float, left: bool) -> None:
     """2 m away, where ranges stray by 5 mm, 12 cm are seen; the margin for things of any size is 14 cm."""
     ball, around = thing(2.0), view(facing(2.0 + behind, 0.0, 1.2, 160))
     assert not around.of(ball.voxels.points, S.margin).free.any()

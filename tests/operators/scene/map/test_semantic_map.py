@@ -87,7 +87,7 @@ def test_a_moved_object_is_moved_and_not_doubled() -> None:
     assert best_iou(message, CRATE) < 0.05
 
 
-def test_what_is_taken_away_goes_and_what_is_hidden_stays() -> None:
+def test_removed_objects_go_and_occluded_ones_stay() -> None:
     screen: Solid = ((1.7, 0.5, 0.6), (0.1, 1.2, 1.2), 0.0, 0)
     assert ids(last(mapped(views([[CRATE, OTHER]] * 6 + [[OTHER]] * 8)))) == [2]
     hidden = views([[CRATE, OTHER]] * 6 + [[CRATE, OTHER, screen]] * 8)
@@ -130,11 +130,11 @@ def test_a_view_without_points_is_survived() -> None:
     assert ids(last(mapped(given))) == [1]
 
 
-def test_maps_repeat_and_a_restored_one_goes_on() -> None:
+def test_restored_semantic_map_continues_identically() -> None:
     assert_repeats(partial(SemanticMap, labels=MUGS_MOVE), views([[CRATE, OTHER]] * 8), 4)
 
 
-def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
+def test_box_is_completed_away_from_the_viewer_by_the_usual_size() -> None:
     """The spine of a book in a shelf, seen along x: 4 cm wide, no depth."""
     seen = (np.array([2.0, 0, 1]), np.array([0.0, 0.04, 0.22]), 0.0)
     center, size, _ = completed(seen, np.array([1.0, 0.0]), BOOK)
@@ -144,7 +144,7 @@ def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
     np.testing.assert_allclose(size, seen[1])
 
 
-def test_boxes_of_the_image_keep_neighbours_apart_and_a_restored_map_goes_on_the_same() -> None:
+def test_image_boxes_separate_neighbours_also_after_restoring() -> None:
     """Two crates that nearly touch, seen from the front: voxels alone cannot tell where one ends."""
     pair: list[Solid] = [((2.5, y, 0.15), (0.3, 0.2, 0.3), 0.0, 0) for y in (0.0, 0.22)]
     given = views([pair] * 10, images=True)

@@ -89,7 +89,7 @@ def test_there_is_one_floor_and_its_height_is_that_of_most_of_it() -> None:
         top(0, 3.2),  # at it
     ],
 )
-def test_what_has_another_plane_side_or_place_is_another_surface(other: SeenSurface) -> None:
+def test_another_plane_side_or_place_is_another_surface(other: SeenSurface) -> None:
     assert len(mapped([[wall(0, 2), other]] * 3).confirmed) == 2
 
 
@@ -171,6 +171,6 @@ def test_surfaces_of_another_time_are_not_used_and_of_another_frame_are_refused(
         known.process(**view_of_a_table(3 * SECOND, surfaces(3 * SECOND).replace(frame="lidar")))
 
 
-def test_a_restored_map_goes_on_with_its_surfaces() -> None:
+def test_restored_map_continues_with_its_surfaces() -> None:
     calls = [view_of_a_table(k * SECOND, surfaces(k * SECOND)) for k in range(1, 5)]
     assert_repeats(partial(SemanticMap, labels="simulator"), calls, 3)

@@ -21,7 +21,7 @@ def motion(x: float, y: float, yaw: float) -> np.ndarray[Any, np.dtype[np.float6
     return T
 
 
-def test_what_was_seen_between_two_keyframes_moves_by_what_lies_between_their_corrections() -> None:
+def test_correction_is_interpolated_between_keyframes() -> None:
     correction = Correction([0, 1000], np.stack([np.eye(4), motion(1.0, 0, 0.2)]))
     np.testing.assert_allclose(correction.at(-5), np.eye(4))
     np.testing.assert_allclose(correction.at(500)[:2, 3], [0.5, -0.025], atol=0.001)
@@ -90,7 +90,7 @@ def test_keyframes_move_the_poses_at_their_times_and_those_behind_them_as_the_la
         np.testing.assert_allclose(trajectory.poses[k - 2], by @ motion(float(k), 0, 0), atol=1e-9)
 
 
-def test_keyframes_that_agree_move_nothing_and_those_of_other_times_are_passed_over() -> None:
+def test_agreeing_keyframes_correct_nothing_and_unmatched_ones_are_ignored() -> None:
     trajectory = drifted()
     known = keyframes([-STEP, 0, 9 * STEP, 20 * STEP], [motion(x, 0, 0) for x in (-7.0, 0.0, 9.0, 50.0)])
 

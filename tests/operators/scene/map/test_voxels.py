@@ -77,7 +77,7 @@ def test_voxels_that_others_have_too_are_theirs_unless_too_few_would_be_left() -
     assert len(voxels.sure([most])) == len(voxels.sure()) == len(grid)
 
 
-def test_voxels_are_doubted_that_are_confirmed_and_not_near_what_is_shown() -> None:
+def test_confirmed_voxels_away_from_those_shown_are_doubted() -> None:
     rng = np.random.default_rng(4)
     voxels, shown = (VoxelSet.of(rng.uniform(-0.5, 0.5, (count, 3)), SIDE) for count in (900, 200))
     confirmed = rng.random(len(voxels)) < 0.6

@@ -43,7 +43,7 @@ def test_there_are_as_many_persons_as_are_asked_for(name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_who_chooses_has_six_candidates_and_gets_what_it_wants(name: str, seed: int) -> None:
+def test_choosing_person_has_six_candidates_and_reaches_its_goals(name: str, seed: int) -> None:
     here = world(name, seed)
     for person in choosers(here):
         timeline = person.mover.timeline
@@ -83,7 +83,7 @@ def test_a_goal_is_known_before_it_is_reached(name: str) -> None:
 
 @pytest.mark.parametrize("name", OFFICE_AND_LONG)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
-def test_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
+def test_hand_reaches_the_grasp_point(name: str, seed: int) -> None:
     here = world(name, seed)
     for mover in (thing.mover for thing in here.objects() if isinstance(thing.mover, Person)):
         before = -mover.timeline.phase
@@ -98,7 +98,7 @@ def test_hand_takes_what_it_reaches_for(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", OFFICE_AND_LONG)
-def test_what_is_carried_lies_on_its_table_while_it_is_not_held(name: str) -> None:
+def test_carried_object_lies_on_its_table_while_not_held(name: str) -> None:
     here = world(name, 0)
     for thing in (t for t in here.objects() if isinstance(t.mover, CarriedObject)):
         for t in np.arange(0, 60, 1.3):

@@ -118,7 +118,7 @@ def test_merged_ticks_are_all_ticks_in_order(sensors: list[tuple[float, int]]) -
 
 
 @pytest.mark.long
-def test_lidar_points_lie_on_what_is_there_and_noise_is_along_the_beam() -> None:
+def test_lidar_points_lie_on_surfaces_and_noise_is_along_the_beam() -> None:
     settings_ = {"rate": 1, "rings": 8, "columns": 90, "missing": 0, "resolution": 0}
     exact, noisy = (
         stream(robot(duration="1s", lidar={**settings_, "noise": noise}), "points")[0] for noise in (0.0, 0.05)
@@ -221,7 +221,7 @@ def test_the_stereo_pair_sees_from_its_own_mount() -> None:
 
 
 @pytest.mark.long
-def test_a_moving_lidar_says_when_it_measured() -> None:
+def test_moving_lidar_sends_time_offsets() -> None:
     (cloud,) = stream(robot(duration="200ms", lidar={"rate": 5, "columns": 60, "rings": 2, "motion": True}), "points")
     assert cloud.time_offsets.min() >= -0.2
     assert cloud.time_offsets.max() == 0
@@ -341,7 +341,7 @@ def test_a_wheel_with_a_bias_counts_too_much_by_that_share() -> None:
 
 
 @pytest.mark.long
-def test_wheel_odometry_errs_as_its_covariance_says() -> None:
+def test_wheel_odometry_errors_are_consistent_with_the_covariance() -> None:
     """Over many seeds, after rounds in which the constant scale errors add up, against wheels without error."""
 
     path, steps = Trajectory(SQUARE, speed=0.6), 51
@@ -426,7 +426,7 @@ def test_a_landmark_behind_something_is_not_sighted() -> None:
     np.testing.assert_array_equal(np.sort(ids.ids), np.flatnonzero(free > way - 0.06))
 
 
-def test_landmarks_are_where_the_map_says() -> None:
+def test_landmark_sightings_agree_with_the_map() -> None:
     source = robot(
         duration="2s", landmarks={"rate": 2, "range_noise": 0, "bearing_noise": 0, "missing": 0, "max_range": 20}
     )

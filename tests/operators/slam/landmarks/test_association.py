@@ -31,7 +31,7 @@ def seen_from(pose: Array, places: Array) -> Array:
     return (places - pose[:2]) @ np.array([[c, -s], [s, c]])
 
 
-def test_a_robot_that_drifted_by_the_distance_between_landmarks_is_placed_by_their_constellation() -> None:
+def test_landmark_constellation_corrects_drift_by_one_landmark_spacing() -> None:
     made = LandmarkFilter()
     see(made, PLACES, times=4)
     made.move(np.zeros(2), 0.0, np.diag([1.0, 1.0, 0.1**2]))
@@ -120,7 +120,7 @@ def test_operator_without_identities_resumes_alike(half: int) -> None:
     assert_resumes_alike(LandmarkSlam, list(zip(messages["odometry"], messages["sightings"], strict=True)), half)
 
 
-def test_the_status_is_given_every_second_and_names_what_was_done() -> None:
+def test_status_is_sent_every_second_with_counts() -> None:
     result = play(LandmarkSlam(association="unknown"), Walk(2).messages(known=False))
     stamps = [status.stamp for status in result["status"]]
     assert len(stamps) >= 10

@@ -22,7 +22,7 @@ def learnt(motion: float, scale: float, extra: float = 0.0) -> list[float]:
     return found
 
 
-def test_noise_of_sightings_is_not_taken_for_that_of_an_odometry_which_they_outweigh() -> None:
+def test_sighting_noise_is_not_attributed_to_the_odometry() -> None:
     assert max(learnt(motion=0.01, scale=1.0, extra=3.0)) == 1.0
 
 

@@ -117,7 +117,7 @@ def test_pose_and_map_are_near_the_truth_and_their_covariances_are_honest() -> N
     assert 1.2 < np.mean(distances) < 3.2  # 2 degrees of freedom
 
 
-def test_covariances_may_be_read_without_a_change_of_what_follows() -> None:
+def test_reading_covariances_does_not_change_the_filter() -> None:
     walk, read, plain = Walk(3), LandmarkFilter(), LandmarkFilter()
     for k, (ids, points) in enumerate(walk.seen[:70]):
         for made in (read, plain):
@@ -151,7 +151,7 @@ def test_a_loop_takes_the_drift_out() -> None:
     assert np.linalg.norm(errors(walk, made)[:2]) < 0.3 * np.linalg.norm(errors(walk, odometry)[:2])
 
 
-def test_landmarks_are_told_apart_without_their_identities() -> None:
+def test_landmarks_without_identities_are_distinguished() -> None:
     for seed in range(5):
         walk = Walk(seed)
         made = walk.filtered(known=False)
@@ -179,7 +179,7 @@ def test_parts_of_a_step_make_the_whole(x: float, y: float, turn: float, share: 
     np.testing.assert_allclose(_arc(step, share) @ rest, whole, atol=1e-9)
 
 
-def test_the_operator_gives_what_the_filter_gives() -> None:
+def test_operator_output_equals_the_filter() -> None:
     walk = Walk(7)
     result = play(LandmarkSlam(), walk.messages())
     pose, made = result["pose"][-1], walk.filtered()
@@ -258,7 +258,7 @@ def test_bad_odometry_is_counted_and_the_next_covers_both_steps() -> None:
 
 
 @pytest.mark.long
-def test_odometry_that_begins_anew_is_a_jump_and_the_landmarks_place_the_robot_again() -> None:
+def test_odometry_reset_is_a_jump_and_landmarks_relocalize_the_robot() -> None:
     walk = Walk(2)
     messages = walk.messages()
     odometry = list(messages["odometry"])

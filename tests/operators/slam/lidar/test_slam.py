@@ -161,7 +161,7 @@ def test_a_loop_takes_drift_away() -> None:
 
 
 @pytest.mark.long
-def test_a_new_map_of_the_odometry_is_tied_to_the_old_one_when_two_scans_say_the_same() -> None:
+def test_new_odometry_map_is_joined_after_two_agreeing_scans() -> None:
     """The LiDAR is lost and carried across the room; its odometry begins anew, with a pose that means nothing."""
     slam, poses = mapper(), on_round(ROUND)
     mapped(poses, [invert(poses[0]) @ T for T in poses], slam)

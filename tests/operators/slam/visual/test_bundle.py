@@ -70,7 +70,7 @@ def off(found: Bundle, truth: Array) -> Array:
 def cost(poses: Array, points: Array, seen: Observations, edges: list[Edge], strength: float) -> float:
     """What the optimum is the least of, written one sighting and one edge at a time."""
     total = 0.0
-    for k, m, pixel, depth in zip(seen.views, seen.points, seen.pixels, seen.depths, strict=True):
+    for k, m, pixel, depth in zip(seen.frames, seen.points, seen.pixels, seen.depths, strict=True):
         p = invert(poses[k]) @ np.append(points[m], 1.0)
         q = CAMERA.T_color_depth @ p
         e = (np.array([K[0, 0] * q[0] / q[2] + K[0, 2], K[1, 1] * q[1] / q[2] + K[1, 2]]) - pixel) / SIGMA_PIXEL
@@ -126,7 +126,7 @@ def _nothing() -> Observations:
     return Observations(none, none, np.zeros((0, 2)), np.zeros(0), SIGMA_PIXEL, np.zeros(0))
 
 
-def test_wrong_sightings_are_outvoted_and_told() -> None:
+def test_wrong_sightings_are_outvoted_and_have_large_residuals() -> None:
     poses, points, seen = scene(7)
     rng = np.random.default_rng(1)
     wrong = rng.random(len(seen.points)) < 0.1

@@ -63,7 +63,7 @@ def test_a_feature_outside_the_window_is_no_match() -> None:
     assert not len(pairs_of(known, seen, np.eye(4), 3.0))
 
 
-def test_two_alike_in_a_window_are_told_apart_by_a_smaller_one() -> None:
+def test_smaller_window_resolves_two_equal_descriptors() -> None:
     known, seen = views(np.eye(4), 1, count=1)
     pixels = np.concatenate([seen.pixels, seen.pixels + np.float32(10)])
     twice = replace(seen, pixels=pixels, descriptors=np.repeat(seen.descriptors, 2, axis=0))

@@ -101,7 +101,7 @@ def test_nodes_without_a_view_add_sightings_and_no_points() -> None:
     assert np.count_nonzero(points.sightings.nodes == number) > 20
 
 
-def test_what_a_node_that_is_gone_saw_is_forgotten_and_lone_points_of_long_ago_too() -> None:
+def test_sightings_of_removed_nodes_and_old_lone_points_are_forgotten() -> None:
     graph, points = graph_of(PATH[:3])
     gone = graph.add(node(3, PATH[3]))
     graph.nodes[gone].view = None

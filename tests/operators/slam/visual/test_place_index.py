@@ -42,7 +42,7 @@ def test_the_place_seen_again_is_the_likest_of_many(seed: int, count: int) -> No
         assert likeness.max() > 3 * np.sort(likeness)[-2]
 
 
-def test_a_place_is_known_by_an_eighth_of_its_features_among_features_that_all_places_share() -> None:
+def test_place_is_recognised_by_few_features_among_common_ones() -> None:
     common = place(999, 80)
     places = [np.concatenate([place(k, 120), common]) for k in range(40)]
     seen = np.concatenate([seen_again(places[7][:120], 1, share=0.21), common])

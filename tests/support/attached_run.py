@@ -10,7 +10,7 @@ from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.supervisor import Supervisor
 
 
-class Background:
+class AttachedRun:
     """A run on a separate thread, until it is told to stop."""
 
     def __init__(self, plan: RunPlan) -> None:
