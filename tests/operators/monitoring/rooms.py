@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dataflow import MappedTopic
+from dataflow import Played
 from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
 from dataflow.messages.diagnostics import Level
 
@@ -92,6 +92,6 @@ def info(frame: str) -> CameraInfo:
     return CameraInfo(stamp=0, frame=frame, width=WIDTH, height=HEIGHT, K=K)
 
 
-def warnings(played: MappedTopic) -> list[str]:
+def warnings(played: Played) -> list[str]:
     """What is warned of, in order."""
     return [s.messages[0] for s in played["status"] if s.levels[0] == Level.WARN]

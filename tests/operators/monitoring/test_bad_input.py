@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dataflow import MappedTopic, play
+from dataflow import Played, play
 from dataflow.execution.failure import OperatorFailure
 from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, PointCloud
 from dataflow.messages.diagnostics import Level
@@ -37,17 +37,17 @@ def room() -> tuple[list[DepthImage], list[Image], list[PointCloud]]:
     return list(depths), list(images), list(clouds)
 
 
-def colors_checked(images: list[Image], depths: list[DepthImage], depth_info: CameraInfo | None = None) -> MappedTopic:
+def colors_checked(images: list[Image], depths: list[DepthImage], depth_info: CameraInfo | None = None) -> Played:
     infos = {"image_info": [info("color")], "depth_info": [depth_info or info("depth")], "extrinsics": [extrinsics()]}
     return play(ColorDepthCheck(period="200ms"), {"image": images, "depth": depths} | infos, static=list(infos))
 
 
-def scans_checked(clouds: list[PointCloud], depths: list[DepthImage], **more: list[Odometry]) -> MappedTopic:
+def scans_checked(clouds: list[PointCloud], depths: list[DepthImage], **more: list[Odometry]) -> Played:
     static = {"depth_info": [info("depth")], "extrinsics": [extrinsics()]}
     return play(DepthScanCheck(), {"cloud": clouds, "depth": depths} | static | more, static=list(static))
 
 
-def assert_no_alarm(played: MappedTopic, firings: int) -> None:
+def assert_no_alarm(played: Played, firings: int) -> None:
     assert [s.levels[0] for s in played["status"]] == [Level.OK] * firings
 
 

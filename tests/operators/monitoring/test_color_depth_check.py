@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from repeated import assert_repeats
 
-from dataflow import MappedTopic, play
+from dataflow import Played, play
 from dataflow.messages import DepthImage, Image, Transforms
 from dataflow.messages.diagnostics import Level
 from operators.geometry.extrinsics import transform_between
@@ -26,7 +26,7 @@ def pairs() -> tuple[list[Image], list[DepthImage]]:
     return [image for _, image, _ in seen], [depth for depth, _, _ in seen]
 
 
-def checked(known: Transforms) -> MappedTopic:
+def checked(known: Transforms) -> Played:
     images, depths = pairs()
     infos = {"image_info": [info("color")], "depth_info": [info("depth")], "extrinsics": [known]}
     return play(ColorDepthCheck(period="200ms"), {"image": images, "depth": depths} | infos, static=list(infos))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from repeated import assert_repeats
 
-from dataflow import MappedTopic, play
+from dataflow import Played, play
 from dataflow.messages import DepthImage, Odometry, PointCloud, Transforms
 from operators.geometry.se3 import exp
 from operators.monitoring import DepthScanCheck
@@ -22,7 +22,7 @@ def pairs(scale: float = 1.0) -> tuple[list[PointCloud], list[DepthImage]]:
     return [cloud for _, _, cloud in seen], [depth for depth, _, _ in seen]
 
 
-def checked(known: Transforms, scale: float = 1.0) -> MappedTopic:
+def checked(known: Transforms, scale: float = 1.0) -> Played:
     clouds, depths = pairs(scale)
     given = {"cloud": clouds, "depth": depths, "depth_info": [info("depth")], "extrinsics": [known]}
     return play(DepthScanCheck(), given, static=["depth_info", "extrinsics"])

@@ -11,7 +11,7 @@ import pytest
 from repeated import assert_repeats
 from scipy.spatial.transform import Rotation
 
-from dataflow import MappedTopic, play
+from dataflow import Played, play
 from dataflow.messages import Imu, Odometry, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import invert
@@ -85,7 +85,7 @@ def extrinsics(sensor: str = "", axis: str = "z", angle: float = 0.0) -> Transfo
     )
 
 
-def checked(known: Transforms | None = None, operator: MotionCheck | None = None, **changed: Any) -> MappedTopic:
+def checked(known: Transforms | None = None, operator: MotionCheck | None = None, **changed: Any) -> Played:
     lidar, camera = changed.get("lidar", odometry("lidar", 20, 2)), changed.get("camera", odometry("camera", 10, 1))
     given: dict[str, Any] = {
         "wheels": changed.get("wheels", wheels()),
