@@ -26,7 +26,7 @@ sys.path.append(str(SUPPORT))
 from zoo.cages import REPEATS  # noqa: E402
 
 from dataflow.causes import sources  # noqa: E402
-from dataflow.causes.why import Why, why  # noqa: E402
+from dataflow.causes.why import CauseReport, why  # noqa: E402
 from dataflow.records.comparison import Difference  # noqa: E402
 from dataflow.verification.report import VerifyReport  # noqa: E402
 from dataflow.verification.verify import verify  # noqa: E402
@@ -88,7 +88,7 @@ def recorded(folder: Path, operators: dict[str, str]) -> dict[str, Path]:
     return paths
 
 
-def faulty(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
+def faulty(folder: Path, names: list[str]) -> Iterator[tuple[str, CauseReport]]:
     """Records and verifies faulty operators; asks about each."""
     gain = folder / "gain.txt"
     gain.write_text("1.5")
@@ -99,7 +99,7 @@ def faulty(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
     yield from ((name, why(paths[name], verify(paths[name]), name)) for name in names)
 
 
-def sound(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
+def sound(folder: Path, names: list[str]) -> Iterator[tuple[str, CauseReport]]:
     """Records and verifies operators that repeat; asks about each as if it did not."""
     paths = recorded(folder, {n: f"use: 'zoo.{'faulty' if n == 'Sound' else 'operators'}:{n}'" for n in names})
     for name in names:
@@ -109,7 +109,7 @@ def sound(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
             yield f"{name}, {'repeats' if repeats else 'does not'}", found
 
 
-def wild(folder: Path, names: list[str]) -> Iterator[tuple[str, Why]]:
+def wild(folder: Path, names: list[str]) -> Iterator[tuple[str, CauseReport]]:
     """Records and verifies registrations; asks about each. The answer is not known beforehand."""
     paths = recorded(folder, {name: WILD[name] for name in names})
     yield from ((name, why(path, verify(path), name)) for name, path in paths.items())

@@ -25,7 +25,7 @@ from link_relay import Relay  # noqa: E402
 
 from dataflow.graph import load_text  # noqa: E402
 from dataflow.machines.keys import issue, new_authority  # noqa: E402
-from dataflow.supervision.plan import Meeting  # noqa: E402
+from dataflow.supervision.plan import Rendezvous  # noqa: E402
 from dataflow.supervision.run import run  # noqa: E402
 from dataflow.verification.verify import verify  # noqa: E402
 
@@ -90,7 +90,7 @@ def main() -> int:
         agent = join("robot", f"tls/127.0.0.1:{relay.port}", folder / "files", "--keys", str(folder / "robot"))
         link = Link(relay, given.stall)
         graph = load_text(GRAPH.format(steps=given.steps, size=given.size, period=given.period))
-        meeting, file = Meeting(f"tls/127.0.0.1:{port}", folder / "laptop"), folder / "run.mcap"
+        meeting, file = Rendezvous(f"tls/127.0.0.1:{port}", folder / "laptop"), folder / "run.mcap"
         try:
             report = run(graph, machines=meeting, live=True, record=file, watch=link.watch)
         finally:

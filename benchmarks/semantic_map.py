@@ -19,7 +19,7 @@ from sensed_worlds import Mapper, World, in_view, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
 from operators.recognition.activity.tracked_people import simulated_labels
-from operators.scene.scoring import NodeScore, PlainlySeen, score_nodes
+from operators.scene.scoring import NodeScore, VisibleImages, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
 
@@ -50,11 +50,11 @@ def chosen(objects: Detections2D, rows: Any) -> Detections2D:
     )
 
 
-def plainly_seen() -> PlainlySeen:
-    return PlainlySeen(VISIBLE, PIXELS, IMAGES)
+def plainly_seen() -> VisibleImages:
+    return VisibleImages(VISIBLE, PIXELS, IMAGES)
 
 
-def seen(world: World) -> PlainlySeen:
+def seen(world: World) -> VisibleImages:
     counts = plainly_seen()
     for frame in world.frames:
         counts.add(frame.objects)

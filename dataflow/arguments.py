@@ -97,7 +97,7 @@ def _given(
 
 
 def find_fault(value: Any, hint: Any, place: str) -> Fault | None:
-    """Returns where `value` is not what `hint` wants; None where it is. What cannot be told counts as right."""
+    """Returns where `value` is not what `hint` wants; None where it is. What cannot be decided counts as right."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         faults = [find_fault(value, each, place) for each in inner]

@@ -199,7 +199,7 @@ def take_over(target: Any, hints: Mapping[str, Any], state: Any, new_part: NewPa
 
 
 def seen(kind: type | None, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a state that `plain` made, for those who look at it: dicts, sets, tuples and queues as the fields of the
+    """Returns a state that `plain` made, for inspection: dicts, sets, tuples and queues as the fields of the
     dataclass `kind` declare them; dataclasses and messages stay mappings, enums names.
 
     What is declared nowhere, or does not fit, is as `plain` made it.

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataflow.arguments import checked
-from dataflow.execution.driver import Driver, HandOver
+from dataflow.execution.driver import Driver, LocalEmitter
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Live, Node
@@ -39,7 +39,7 @@ class Played:
         return {port: [m.digest().hex() for m in messages] for port, messages in self.outputs.items()}
 
 
-class _Collector(HandOver):
+class _Collector(LocalEmitter):
     """Keeps what the operator emits."""
 
     def __init__(self, driver: Driver, node: Node) -> None:
@@ -57,7 +57,7 @@ class _Collector(HandOver):
 class _Arrivals:
     """Whole streams as a feed, one message at a time: static ones first, else the oldest stamp."""
 
-    def __init__(self, emitter: HandOver, streams: Mapping[str, Sequence[Message]], static: frozenset[str]) -> None:
+    def __init__(self, emitter: LocalEmitter, streams: Mapping[str, Sequence[Message]], static: frozenset[str]) -> None:
         self.firings, self.last, self.ended = 0, NEVER, False
         self._emitter, self._streams = emitter, streams
         arrivals = [(s not in static, m.stamp, s, seq, m) for s in streams for seq, m in enumerate(streams[s])]
@@ -127,7 +127,7 @@ def play(
             runner = OperatorRunner(node, collector, static=statics, seed=seed, paranoid=paranoid, operator=operator)
             driver.add(runner)
             given = {stream: messages for streams in wired.values() for stream, messages in streams.items()}
-            driver.feeding.feeds.append(_Arrivals(HandOver(driver), given, statics))
+            driver.feeding.feeds.append(_Arrivals(LocalEmitter(driver), given, statics))
         driver.set_up()
         while driver.turn():
             pass

@@ -18,15 +18,15 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Told:
-    """Labels, mean and deviation (shares of 1) from a model's metadata, each None where these do not tell."""
+class ImageMetadata:
+    """Labels, mean and deviation (shares of 1) from a model's metadata, each None where it is missing."""
 
     labels: Labels | None
     mean: Triple | None
     std: Triple | None
 
 
-def told(file: Path, metadata: Mapping[str, str]) -> Told:
+def told(file: Path, metadata: Mapping[str, str]) -> ImageMetadata:
     """Reads the metadata `names`, `palette`, `mean` and `std`, JSON or as Python writes it, and those of our training.
 
     `names` is a list, or a mapping from number to name (as Ultralytics exports it); `palette` has three numbers for
@@ -40,7 +40,7 @@ def told(file: Path, metadata: Mapping[str, str]) -> Told:
             raise ModelError(f"{file}: metadata 'palette' must be a list of {len(names)} colours, one for each name")
         colors = {name: color(file, name, values) for name, values in zip(names, palette, strict=True)}
     labels = None if names is None else Labels(names, colors)
-    return Told(labels, _triple(file, metadata, "mean"), _triple(file, metadata, "std"))
+    return ImageMetadata(labels, _triple(file, metadata, "mean"), _triple(file, metadata, "std"))
 
 
 def _names(file: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | None:

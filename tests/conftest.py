@@ -172,7 +172,7 @@ def data_dir() -> Path:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets verification call its workers' functions in this process: for tests of its verdicts."""
-    from dataflow.api.here import call_here
+    from dataflow.api.in_process import call_here
     from dataflow.verification import verify
 
     monkeypatch.setattr(verify, "call_workers", call_here)

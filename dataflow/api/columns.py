@@ -105,7 +105,7 @@ class Elements:
 def parallel_fields(message: type[Message]) -> tuple[Field, ...]:
     """The fields of a message type that run in parallel: those that share the first symbol of most arrays.
 
-    Lists of strings may belong to them; their lengths tell. Empty where there are no such arrays.
+    Lists of strings may belong to them, as their lengths show. Empty where there are no such arrays.
     """
     counts: dict[str, int] = {}
     for field in message.ARRAYS:

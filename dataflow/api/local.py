@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from dataflow.execution.driver import Driver, HandOver
+from dataflow.execution.driver import Driver, LocalEmitter
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
@@ -67,7 +67,7 @@ class Recorder:
         return self._sink.close(outcome)
 
 
-class Emitting(HandOver):
+class Emitting(LocalEmitter):
     """Gives what operators emit to the recorder, too."""
 
     recorder: Recorder | None = None

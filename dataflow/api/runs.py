@@ -14,7 +14,7 @@ from dataflow.api.html import run_html, verify_html
 from dataflow.api.local import LocalRun, Watch
 from dataflow.api.recordings import RecordedStreams, open
 from dataflow.arguments import checked, evaluated, require
-from dataflow.editing.untouched import keep_untouched
+from dataflow.editing.unmapped_topics import keep_untouched
 from dataflow.execution.generators import seeding
 from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph.problems import did_you_mean
@@ -235,7 +235,7 @@ def verify(
     processes. Operators of a notebook are re-executed in this process. Raises `ReplayError`,
     `RunFailed`.
     """
-    from dataflow.api.here import call_here
+    from dataflow.api.in_process import call_here
     from dataflow.verification.verify import verify as verify_recording
     from dataflow.verification.workers.processes import call_workers
 

@@ -16,13 +16,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
-from dataflow.blame.again import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
 from dataflow.blame.field import Field, differ, is_measured
 from dataflow.blame.line import Call, Line
 from dataflow.blame.links import Chain, Effect, Link, Way
 from dataflow.blame.nudge import nudged
-from dataflow.blame.others import ANOTHER, Others, Taken, without
+from dataflow.blame.repeated_calls import AS_IT_WAS, RAISED, Effects, Other, Place, Slot, place_of, with_messages
 from dataflow.blame.split import split
+from dataflow.blame.substitutes import ANOTHER, SubstituteMessages, TakenMessage, without
 from dataflow.execution.feeds.playable import span_of
 from dataflow.execution.threads import limited_threads
 from dataflow.graph.model import Graph
@@ -85,9 +85,9 @@ class Blame:
         self._seen: set[Call] = set()
         self._searched: dict[str, int] = {}
         """By operator, from which call on it is known which ones left a mark."""
-        self._joint: list[list[Taken]] = []
+        self._joint: list[list[TakenMessage]] = []
         """Messages of which none changes the value alone, though all of them together do."""
-        self._messages = Others(recording, self._taken)
+        self._messages = SubstituteMessages(recording, self._taken)
         self._raised = ""
         self.made = 0
         self._open: list[tuple[tuple[int, int, int], Call]] = []
@@ -255,19 +255,19 @@ class Blame:
     def _link_all(self, call: Call, firing: Firing, found: Sequence[tuple[Slot, tuple[Effect, ...]]]) -> None:
         """Makes links; one for messages of a stream that follow each other, and decide only together."""
         stamp = self._lines[call.operator].records[call.number].stamp
-        joint: dict[int, list[Taken]] = defaultdict(list)
+        joint: dict[int, list[TakenMessage]] = defaultdict(list)
         links = self._chain.links
         for (name, k), effects in found:
             entry = entries_of(firing.inputs[name])[k]
             maker, place = self._maker(entry), place_of(entry)
             alone = any(effect.together == 1 for effect in effects)
             before = links[-1] if links else None
-            if before is not None and not alone and _goes_on(before, Taken(call, name, entry), effects):
+            if before is not None and not alone and _goes_on(before, TakenMessage(call, name, entry), effects):
                 links[-1] = replace(before, last=place[2])
             else:
                 links.append(Link(call, stamp, name, place, entry.stamp, maker, effects))
             if not alone:
-                joint[id(effects)].append(Taken(call, name, entry))
+                joint[id(effects)].append(TakenMessage(call, name, entry))
             elif maker is not None:
                 self._queue(maker)
         self._joint += joint.values()
@@ -337,7 +337,7 @@ class Blame:
         """The fields of a message that change the value when they are nudged by themselves."""
         name, k = slot
         entry = entries_of(firing.inputs[name])[k]
-        grouped = self._messages.groups(Taken(call, name, entry))
+        grouped = self._messages.groups(TakenMessage(call, name, entry))
         if sum(map(len, grouped)) < 2:
             return tuple(each for names in grouped for each in names)
         found: list[str] = []
@@ -353,7 +353,7 @@ class Blame:
         self, call: Call, firing: Firing, slots: Sequence[Slot]
     ) -> Iterator[tuple[Way, Mapping[str, InputValue]]]:
         """Yields the inputs with these messages nudged, taken from the message before, left out."""
-        taken = [Taken(call, name, entries_of(firing.inputs[name])[k]) for name, k in slots]
+        taken = [TakenMessage(call, name, entries_of(firing.inputs[name])[k]) for name, k in slots]
         for way, messages in self._messages.instead(taken, hold=False):
             yield way, with_messages(firing, dict(zip(slots, messages, strict=True)))
         lacking = without(self.graph.nodes[call.operator], firing, slots)
@@ -445,10 +445,10 @@ class Blame:
                 return effects
         return ()
 
-    def _given(self, call: Call) -> list[Taken]:
+    def _given(self, call: Call) -> list[TakenMessage]:
         """The messages of a call whose inputs are held, in the order of its inputs."""
         inputs = self._lines[call.operator].shots[call.number].firing.inputs
-        return [Taken(call, name, entry) for name, given in inputs.items() for entry in entries_of(given)]
+        return [TakenMessage(call, name, entry) for name, given in inputs.items() for entry in entries_of(given)]
 
     def _goes_back_to(self, operator: str, first: int, begin: int) -> int:
         """The call down to which at least the search for marks goes on before `begin`: that itself where it may end.
@@ -497,10 +497,10 @@ class Blame:
 
     # ------------------------------------------------------------------------------------------ what is in common
 
-    def _look_behind(self, joint: Sequence[Taken]) -> None:
+    def _look_behind(self, joint: Sequence[TakenMessage]) -> None:
         """Finds the sensors' messages behind some that decide only together: those that decide alone, through all of
         them; else the smallest run of one stream; else of several streams."""
-        by_stream: dict[tuple[str, int], list[Taken]] = defaultdict(list)
+        by_stream: dict[tuple[str, int], list[TakenMessage]] = defaultdict(list)
         for each in sorted(self._sensed_behind(joint), key=lambda each: place_of(each.entry)):
             by_stream[place_of(each.entry)[:2]].append(each)
         runs = [run for taken in by_stream.values() for run in split(taken, self._sensed)]
@@ -524,10 +524,10 @@ class Blame:
             makers = (self._maker(each.entry) for each in joint)
             self._chain.loose += [maker for maker in makers if maker is not None][:1]
 
-    def _sensed_behind(self, joint: Sequence[Taken]) -> list[Taken]:
+    def _sensed_behind(self, joint: Sequence[TakenMessage]) -> list[TakenMessage]:
         """Returns the messages at the beginning of all that some come from, with the calls that took them; the inputs
         of the calls between are held then."""
-        sensed: dict[Place, Taken] = {}
+        sensed: dict[Place, TakenMessage] = {}
         makers: dict[str, set[int]] = defaultdict(set)
         done: set[str] = set()
         left = list(joint)
@@ -559,7 +559,7 @@ class Blame:
             self._reach(Call(operator, first), last)
         return [number for number in range(first, last + 1) if number in line.shots]
 
-    def _sensed(self, taken: Sequence[Taken]) -> tuple[Effect, ...]:
+    def _sensed(self, taken: Sequence[TakenMessage]) -> tuple[Effect, ...]:
         """The effects of sensors' messages that are others for all calls that take them; of several, one."""
         effects: dict[Way, Effect] = {}
         for way, messages in self._messages.instead(taken, hold=True):
@@ -570,7 +570,7 @@ class Blame:
                     break
         return tuple(effects.values())
 
-    def _elsewhere(self, taken: Sequence[Taken]) -> Iterator[tuple[Sequence[Taken], tuple[Effect, ...]]]:
+    def _elsewhere(self, taken: Sequence[TakenMessage]) -> Iterator[tuple[Sequence[TakenMessage], tuple[Effect, ...]]]:
         """Yields those of some sensors' messages that decide when they are others of their stream for all calls that
         take them, each another one: an operator may know one that comes twice, such as a picture of a hanging camera.
         """
@@ -578,7 +578,7 @@ class Blame:
         for k in range(ANOTHER if all(there.values()) else 0):
             chosen = {place: others[(k + n) % len(others)] for n, (place, others) in enumerate(there.items())}
 
-            def shows(part: Sequence[Taken], chosen: Mapping[Place, Message] = chosen) -> tuple[Effect, ...]:
+            def shows(part: Sequence[TakenMessage], chosen: Mapping[Place, Message] = chosen) -> tuple[Effect, ...]:
                 messages = {place: chosen[place] for place in (place_of(each.entry) for each in part)}
                 found = self._changed("another", {}, messages=messages)
                 return () if found is None else (Effect("another", (), found[0], len(part)),)
@@ -625,7 +625,7 @@ class Blame:
 _SAME: Any = object()
 
 
-def _goes_on(link: Link, taken: Taken, effects: tuple[Effect, ...]) -> bool:
+def _goes_on(link: Link, taken: TakenMessage, effects: tuple[Effect, ...]) -> bool:
     """Returns whether a message follows that of a link, with which it decides together."""
     same = link.effects is effects and (link.call, link.input) == (taken.call, taken.input)
     stream, incarnation, number = place_of(taken.entry)

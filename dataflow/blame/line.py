@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from dataflow.capture.capture import changes_between, shot_of
-from dataflow.capture.captured import Shot, make_change, set_up
+from dataflow.capture.captured import CapturedCall, make_change, set_up
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Fired
+from dataflow.debugging.fired import RepeatedCall
 from dataflow.execution.calls import Calls
 from dataflow.execution.effects.journal import RecordedJournal
 from dataflow.execution.failure import RAISED, readable
@@ -62,7 +62,7 @@ class Line:
         self._with_states = {bisect.bisect_left(places, (r.incarnation, r.index)) for r in given}
         self.other: int | None = None
         """The first call that was read and is not what was recorded."""
-        self.shots: dict[int, Shot] = {}
+        self.shots: dict[int, CapturedCall] = {}
         self.first = len(self.records)
         self.nbytes = 0
         """Of these inputs; a message that several calls take counts each time."""
@@ -121,10 +121,10 @@ class Line:
         place = self.records[first].incarnation, self.records[first].index
         changes = changes_between(self._changes, self._debugger, place, until)
         read: set[int] = set()
-        added: dict[int, Shot] = {}
+        added: dict[int, CapturedCall] = {}
         nbytes = 0
 
-        def take(each: Fired) -> bool:
+        def take(each: RepeatedCall) -> bool:
             nonlocal nbytes
             if each.number <= until:
                 read.add(each.number)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from dataflow.blame.again import Place
 from dataflow.blame.field import change, is_measured
 from dataflow.blame.line import Call
 from dataflow.blame.nudge import SIZE
+from dataflow.blame.repeated_calls import Place
 
 Way = Literal["nudged", "made finite", "the one before", "left out", "another", "call left out", "a new operator"]
 """The change of an input, or of the calls before."""
@@ -61,7 +61,7 @@ class Link:
         return [(stream, incarnation, n) for n in range(number, (number if self.last is None else self.last) + 1)]
 
 
-class Untried(NamedTuple):
+class UntestedInput(NamedTuple):
     """An input of a call, or with `input` "" what the calls up to `last` leave in the state, of which every change made
     a call raise: not known is whether it decides. `error`: the last one's."""
 
@@ -96,7 +96,7 @@ class Chain:
     loose: list[Call] = field(default_factory=list)
     tried: Counter[Way] = field(default_factory=Counter)
     raised: Counter[str] = field(default_factory=Counter)
-    untried: list[Untried] = field(default_factory=list)
+    untried: list[UntestedInput] = field(default_factory=list)
     left: list[Call] = field(default_factory=list)
     unsplit: list[tuple[str, int, int]] = field(default_factory=list)
     ended: dict[str, int] = field(default_factory=dict)
@@ -174,9 +174,9 @@ class Chain:
         """Notes what could not be tried; calls beside those that were noted before are noted with them."""
         for k, noted in enumerate(self.untried):
             if not name and not noted.input and noted.call.operator == call.operator and last + 1 >= noted.call.number:
-                self.untried[k] = Untried(min(call, noted.call), max(last, noted.last), "", error)
+                self.untried[k] = UntestedInput(min(call, noted.call), max(last, noted.last), "", error)
                 return
-        self.untried.append(Untried(call, last, name, error))
+        self.untried.append(UntestedInput(call, last, name, error))
 
     def as_json(self) -> dict[str, Any]:
         """Returns it as JSON values; a value that is no number is as the message holds it."""

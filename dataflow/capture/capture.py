@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dataflow.capture.captured import BEFORE, Captured, Change, Outcome, Predicate, Setting, Shot
+from dataflow.capture.captured import BEFORE, CapturedCall, CapturedCalls, Change, OperatorSettings, Outcome, Predicate
 from dataflow.capture.repeats import NotRepeated, check_repeats
 from dataflow.debugging.debugger import DebugError, Debugger
-from dataflow.debugging.fired import Fired
+from dataflow.debugging.fired import RepeatedCall
 from dataflow.debugging.reduce import shortest_end, smallest
 from dataflow.execution.failure import place_of, readable
 from dataflow.messages.base import Message
@@ -42,13 +42,13 @@ MOST_BYTES = 2**29
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class CaptureResult:
     """A captured call, with the number of it, of the operator's calls, of those that are left, and what it begins with.
 
     `wrong`: what is shown, in words.
     """
 
-    captured: Captured
+    captured: CapturedCalls
     number: int
     calls: int
     left: int
@@ -56,11 +56,11 @@ class Found:
     wrong: str
 
 
-class Wrong:
+class FaultCondition:
     """The fault of a call: an expression is true of it, it raises an error (the class and line count), or its outputs
     are not the recorded ones."""
 
-    def __init__(self, fired: Fired, predicate: str) -> None:
+    def __init__(self, fired: RepeatedCall, predicate: str) -> None:
         self.predicate = Predicate(predicate) if predicate else None
         self.error, self.digests = None, None
         if predicate:
@@ -82,7 +82,7 @@ class Wrong:
         return outcome.error is None and outcome.digests == self.digests
 
 
-class Beginning(NamedTuple):
+class StartState(NamedTuple):
     """A state (None: a new operator), the number of the first call behind it, and the place in the operator's records
     up to which parameters were changed before. `text`: in words."""
 
@@ -94,10 +94,10 @@ class Beginning(NamedTuple):
     """The state may be wrong already: the mended operator, too, may be wrong behind it."""
 
 
-class Best(NamedTuple):
+class SmallestCapture(NamedTuple):
     """The fewest calls that were found so far, and what they begin with."""
 
-    captured: Captured
+    captured: CapturedCalls
     begins: str
 
 
@@ -107,7 +107,7 @@ def _sort(error: BaseException) -> tuple[type, str, int]:
 
 def capture(
     recording: Recording, debugger: Debugger, number: int | None = None, predicate: str = "", seconds: float = SECONDS
-) -> Found:
+) -> CaptureResult:
     """Captures the call of that number, by default the first that does not give what was recorded, or for which
     `predicate` is true.
 
@@ -115,13 +115,13 @@ def capture(
     not give the same each time; SyntaxError for a predicate that is no expression.
     """
     fired = _aimed(debugger, number, predicate)
-    wrong = Wrong(fired, predicate)
+    wrong = FaultCondition(fired, predicate)
     expected = None if wrong.digests is None else _recorded(fired)
     recorded_error = "" if wrong.error is not None else fired.recorded_error or ""
     setting = _setting(recording, debugger)
     ordered = FiringLog.read(recording).ordered(debugger.node)
     records = [r for r in ordered if r.kind not in CALLS and r.outcome != "error"]
-    best: Best | None = None
+    best: SmallestCapture | None = None
     too_large = False
     for begin in _beginnings(records, debugger, fired, wrong):
         if best is not None and _suffices(best, begin, len(debugger.calls)):
@@ -131,10 +131,10 @@ def capture(
             too_large = True
             continue
         parameters = parameters_at(r for r in records if (r.incarnation, r.index) <= begin.place)
-        found = Captured(setting, *parameters, begin.state, tuple(shots), expected, recorded_error, predicate)
+        found = CapturedCalls(setting, *parameters, begin.state, tuple(shots), expected, recorded_error, predicate)
         reduced = _reduced(found, wrong, time.monotonic() + seconds)
         if reduced is not None and (best is None or len(reduced.shots) < len(best.captured.shots)):
-            best = Best(reduced, begin.text)
+            best = SmallestCapture(reduced, begin.text)
     if best is None and too_large:
         raise DebugError(
             f"call {fired.number} of {debugger.node.name}: the inputs up to it are more than {MOST_BYTES:,} bytes: "
@@ -153,10 +153,12 @@ def capture(
             f"call {fired.number} of {debugger.node.name} does not repeat: {error}. A test of it would pass and fail "
             f"by chance: dataflow verify {recording.path} --why finds the cause"
         ) from None
-    return Found(best.captured, fired.number, len(debugger.calls), len(best.captured.shots), best.begins, wrong.text)
+    return CaptureResult(
+        best.captured, fired.number, len(debugger.calls), len(best.captured.shots), best.begins, wrong.text
+    )
 
 
-def _aimed(debugger: Debugger, number: int | None, predicate: str) -> Fired:
+def _aimed(debugger: Debugger, number: int | None, predicate: str) -> RepeatedCall:
     name = debugger.node.name
     true = Predicate(predicate) if predicate else None
     if number is not None:
@@ -182,7 +184,7 @@ def _raised(predicate: Predicate) -> str:
     return "" if predicate.problem is None else f", which raises {readable(predicate.problem)}"
 
 
-def _recorded(fired: Fired) -> dict[str, Message]:
+def _recorded(fired: RepeatedCall) -> dict[str, Message]:
     """The recorded messages of a call, by port. Raises `DebugError` where one is not in the recording."""
     made = [made for made in fired.made if made.recorded is not None]
     if len(made) != sum(emission is not None for emission in fired.record.outputs):
@@ -193,13 +195,15 @@ def _recorded(fired: Fired) -> dict[str, Message]:
     return {each.port: each.recorded for each in made if each.recorded is not None}
 
 
-def _setting(recording: Recording, debugger: Debugger) -> Setting:
+def _setting(recording: Recording, debugger: Debugger) -> OperatorSettings:
     node, graph = debugger.node, debugger.graph
     known = graph.seed, seeding_of(recording), graph.threads
-    return Setting(node.name, node.use, dict(node.params), *known, dict(node.outputs), node.env)
+    return OperatorSettings(node.name, node.use, dict(node.params), *known, dict(node.outputs), node.env)
 
 
-def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fired, wrong: Wrong) -> Iterator[Beginning]:
+def _beginnings(
+    records: Sequence[FiringRecord], debugger: Debugger, fired: RepeatedCall, wrong: FaultCondition
+) -> Iterator[StartState]:
     """Where the calls may begin, the surest first.
 
     The state of a new operator is right, and so is a recorded one where the recorded outputs are. The state that the
@@ -208,7 +212,7 @@ def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fire
     number, incarnation = fired.number, fired.call.incarnation
     here = (incarnation, fired.call.record)
     if debugger.node.operator.stateless:
-        yield Beginning(None, number, here, "nothing, as it is stateless")
+        yield StartState(None, number, here, "nothing, as it is stateless")
         return
     first = next(k for k, call in enumerate(debugger.calls) if call.incarnation == incarnation)
     before = [r for r in records if r.incarnation == incarnation and r.index < fired.call.record]
@@ -216,16 +220,16 @@ def _beginnings(records: Sequence[FiringRecord], debugger: Debugger, fired: Fire
     if known and wrong.digests is not None:
         index = known[-1].index
         after = next(k for k in range(first, number + 1) if debugger.calls[k].record > index)
-        yield Beginning(known[-1].detail["state"], after, (incarnation, index), "the recorded state")
+        yield StartState(known[-1].detail["state"], after, (incarnation, index), "the recorded state")
     if number - first < MOST_CALLS:
         begun = [r.index for r in before if r.kind in ("setup", "cut") and r.index < debugger.calls[first].record]
-        yield Beginning(None, first, (incarnation, max(begun, default=-1)), "a new operator")
+        yield StartState(None, first, (incarnation, max(begun, default=-1)), "a new operator")
     if fired.before is not None:
         text = "the state that it has here before the call, which may be wrong already"
-        yield Beginning(fired.before, number, here, text, doubtful=True)
+        yield StartState(fired.before, number, here, text, doubtful=True)
 
 
-def _suffices(best: Best, begin: Beginning, calls: int) -> bool:
+def _suffices(best: SmallestCapture, begin: StartState, calls: int) -> bool:
     """Returns whether it is needless to begin there, too. A state that may be wrong is begun with only where the calls
     from a right one are too many for a test."""
     if not begin.doubtful:
@@ -254,15 +258,15 @@ def changes_between(
 
 
 def _shots(
-    debugger: Debugger, first: int, fired: Fired, changes: Mapping[int, Sequence[Change]]
-) -> Sequence[Shot] | None:
+    debugger: Debugger, first: int, fired: RepeatedCall, changes: Mapping[int, Sequence[Change]]
+) -> Sequence[CapturedCall] | None:
     """The calls from `first` to that of `fired`; None where their inputs are more than `MOST_BYTES`."""
-    shots: list[Shot] = []
+    shots: list[CapturedCall] = []
     held: set[bytes] = set()
     nbytes = 0
     pending: list[Change] = []
 
-    def take(each: Fired) -> bool:
+    def take(each: RepeatedCall) -> bool:
         nonlocal nbytes
         if each.number >= first:
             pending.extend(changes.get(each.number, ()))
@@ -280,7 +284,7 @@ def _shots(
     return shots if nbytes <= MOST_BYTES else None
 
 
-def shot_of(debugger: Debugger, fired: Fired, changes: tuple[Change, ...]) -> Shot:
+def shot_of(debugger: Debugger, fired: RepeatedCall, changes: tuple[Change, ...]) -> CapturedCall:
     """Returns a call of the debugger, with the changes before it, as one that can be made apart from it."""
     record, firing = fired.record, fired.firing
     assert firing is not None
@@ -288,10 +292,10 @@ def shot_of(debugger: Debugger, fired: Fired, changes: tuple[Change, ...]) -> Sh
     emitted = zip(debugger.node.outputs, record.outputs, strict=False)
     recorded = {port: e.digest for port, e in emitted if e is not None and e.seq != WITHHELD}
     here = {made.port: made.here.digest() for made in fired.made if made.here is not None}
-    return Shot(firing, effects, recorded, changes, here)
+    return CapturedCall(firing, effects, recorded, changes, here)
 
 
-def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
+def _reduced(whole: CapturedCalls, wrong: FaultCondition, deadline: float) -> CapturedCalls | None:
     """The smallest part of the calls that is wrong in the same way; None where all of them are not.
 
     Calls that right code needs for what was recorded must stay: behind a state all do, and behind a new operator the
@@ -328,9 +332,9 @@ def _reduced(whole: Captured, wrong: Wrong, deadline: float) -> Captured | None:
     return _fewer_messages(_part(whole, (*left, last)), wrong, deadline)
 
 
-def _part(whole: Captured, numbers: Sequence[int]) -> Captured:
+def _part(whole: CapturedCalls, numbers: Sequence[int]) -> CapturedCalls:
     """Of the calls those of these numbers; changes before the others are made before the next of them."""
-    shots: list[Shot] = []
+    shots: list[CapturedCall] = []
     after = 0
     for number in numbers:
         changes = tuple(change for shot in whole.shots[after : number + 1] for change in shot.changes)
@@ -339,13 +343,13 @@ def _part(whole: Captured, numbers: Sequence[int]) -> Captured:
     return replace(whole, shots=tuple(shots))
 
 
-def _as_recorded(outcome: Outcome, earlier: Sequence[Shot]) -> bool:
+def _as_recorded(outcome: Outcome, earlier: Sequence[CapturedCall]) -> bool:
     """Returns whether the calls just before the last one made what was recorded."""
     recorded = [shot.digests for shot in earlier[-BEFORE:]]
     return len(recorded) == BEFORE and list(outcome.before) == recorded
 
 
-def _fewer_messages(captured: Captured, wrong: Wrong, deadline: float) -> Captured:
+def _fewer_messages(captured: CapturedCalls, wrong: FaultCondition, deadline: float) -> CapturedCalls:
     """Without the messages of the last call's `Batch` inputs that an error or a predicate does not need."""
     if wrong.digests is not None:
         return captured
@@ -353,7 +357,7 @@ def _fewer_messages(captured: Captured, wrong: Wrong, deadline: float) -> Captur
         if isinstance(given, tuple) and given:
             whole = captured
 
-            def shows(entries: Sequence[Any], whole: Captured = whole, name: str = name) -> bool:
+            def shows(entries: Sequence[Any], whole: CapturedCalls = whole, name: str = name) -> bool:
                 tried = _with(whole, name, entries)
                 return time.monotonic() < deadline and wrong.shows(tried.play())
 
@@ -361,14 +365,14 @@ def _fewer_messages(captured: Captured, wrong: Wrong, deadline: float) -> Captur
     return captured
 
 
-def _with(captured: Captured, name: str, entries: Sequence[Any]) -> Captured:
+def _with(captured: CapturedCalls, name: str, entries: Sequence[Any]) -> CapturedCalls:
     """With other messages in an input of the last call."""
     *earlier, last = captured.shots
     firing = replace(last.firing, inputs={**last.firing.inputs, name: tuple(entries)})
     return replace(captured, shots=(*earlier, last._replace(firing=firing)))
 
 
-def write_test(found: Found, path: Path, recording: str, command: str) -> int:
+def write_test(found: CaptureResult, path: Path, recording: str, command: str) -> int:
     """Writes the test to `path` and what it needs beside it (`.capture`); returns the bytes of that file."""
     data = found.captured.to_bytes()
     path.with_suffix(".capture").write_bytes(data)

@@ -47,7 +47,7 @@ class Change(NamedTuple):
     """(incarnation, stamp in ns)."""
 
 
-class Shot(NamedTuple):
+class CapturedCall(NamedTuple):
     """One call: what it was given, what was recorded of its effects and, by port, of its outputs (digests), and the
     changes between the call before and this one. `here`: the digests of its outputs in the debugger."""
 
@@ -59,7 +59,7 @@ class Shot(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class OperatorSettings:
     """The operator: its name and class (`module:Class`), parameters, seed of the graph, version of the seeding,
     threads of libraries, output ports, environment (`env:`)."""
 
@@ -103,7 +103,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Captured:
+class CapturedCalls:
     """Calls of one operator; the last one is that in which something is wrong. They begin with the `state`, if there is
     one, and the parameters that had been changed by then: before the last `setup()`, and `since`.
 
@@ -112,11 +112,11 @@ class Captured:
     that it raises nothing.
     """
 
-    setting: Setting
+    setting: OperatorSettings
     at_setup: Mapping[str, Any]
     since: Mapping[str, Any]
     state: bytes | None
-    shots: tuple[Shot, ...]
+    shots: tuple[CapturedCall, ...]
     expected: Mapping[str, Message] | None = None
     recorded_error: str = ""
     predicate: str = ""
@@ -212,7 +212,7 @@ class Captured:
         return zlib.compress(pack_state(content), 6)
 
     @staticmethod
-    def from_bytes(data: bytes) -> Captured:
+    def from_bytes(data: bytes) -> CapturedCalls:
         """Reads what `to_bytes` gave. Raises ValueError for anything else."""
         try:
             content = unpack_state(zlib.decompress(data))
@@ -220,11 +220,11 @@ class Captured:
             raise ValueError(f"no captured call: {error}") from error
         if content["format"] != FORMAT:
             raise ValueError(f"a captured call of format {content['format']!r}; this version reads {FORMAT}")
-        setting = Setting(**content["setting"])
+        setting = OperatorSettings(**content["setting"])
         import_module(setting.use.partition(":")[0])  # declares its types of messages
         messages = {key: typed(Message, value) for key, value in content["messages"].items()}
         expected = content["expected"]
-        return Captured(
+        return CapturedCalls(
             setting,
             content["at_setup"],
             content["since"],
@@ -264,7 +264,7 @@ def check(path: Path) -> None:
 
     Raises `AssertionError`, or what the operator raises, where it is wrong still, and `EnvError`.
     """
-    captured = Captured.from_bytes(path.read_bytes())
+    captured = CapturedCalls.from_bytes(path.read_bytes())
     env, threads = captured.setting.env, captured.setting.threads
     if env is None or is_environment(env):
         captured.check()
@@ -277,7 +277,7 @@ def check(path: Path) -> None:
         raise AssertionError(f"in the environment {env}: {done.stderr.strip() or f'exit code {done.returncode}'}")
 
 
-def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[Shot]) -> Outcome:
+def _made(calls: Calls, journal: RecordedJournal, shots: Sequence[CapturedCall]) -> Outcome:
     """Makes the calls, to the last or to the first that raises."""
     ports = tuple(calls.node.outputs)
     before: deque[dict[str, bytes]] = deque(maxlen=BEFORE)
@@ -327,7 +327,7 @@ def _differences(expected: Mapping[str, Message], outputs: Mapping[str, Message]
     return found
 
 
-def _packed(shot: Shot, kept: Any) -> dict[str, Any]:
+def _packed(shot: CapturedCall, kept: Any) -> dict[str, Any]:
     firing = shot.firing
     entries = {
         name: [_form(given), [[e.stream, e.seq, e.incarnation, kept(e.value)] for e in entries_of(given)]]
@@ -351,7 +351,7 @@ def _form(given: InputValue) -> str:
     return "one" if isinstance(given, Entry) else "by stream" if isinstance(given, Mapping) else "all"
 
 
-def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> Shot:
+def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> CapturedCall:
     inputs: dict[str, InputValue] = {}
     for name, (form, listed) in values["inputs"].items():
         entries = tuple(
@@ -364,4 +364,4 @@ def _unpacked(values: Mapping[str, Any], messages: Mapping[str, Message]) -> Sho
         values["stamp"], values["kind"], values["tick"], inputs, frozenset(values["stale"]), frozenset(values["late"])
     )
     changes = tuple(Change(kind, name, value, tuple(place)) for kind, name, value, place in values["changes"])
-    return Shot(firing, values["effects"], {}, changes)
+    return CapturedCall(firing, values["effects"], {}, changes)

@@ -9,7 +9,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from dataflow.capture.captured import Captured, Outcome, Predicate
+from dataflow.capture.captured import CapturedCalls, Outcome, Predicate
 from dataflow.execution.failure import place_of
 
 TIMES = 20
@@ -26,7 +26,7 @@ class NotRepeated(RuntimeError):
     """Raised for calls that do not give the same each time, or cannot be made in a new process."""
 
 
-def check_repeats(captured: Captured) -> None:
+def check_repeats(captured: CapturedCalls) -> None:
     """Makes the calls again, some times here and in new processes. Raises `NotRepeated` where one result is another."""
     began = time.monotonic()
     here = results(captured)
@@ -47,7 +47,7 @@ def check_repeats(captured: Captured) -> None:
         raise NotRepeated("made again in a new process, it gives another result")
 
 
-def results(captured: Captured) -> list[str]:
+def results(captured: CapturedCalls) -> list[str]:
     """Makes the calls again; returns what each time shows, in a line: whether the predicate is true, the error and its
     line of code, or the digests of the outputs."""
     began = time.monotonic()
@@ -57,7 +57,7 @@ def results(captured: Captured) -> list[str]:
     return found
 
 
-def _result(captured: Captured, outcome: Outcome) -> str:
+def _result(captured: CapturedCalls, outcome: Outcome) -> str:
     if captured.predicate:
         return str(Predicate(captured.predicate).is_true(outcome.names()))
     if outcome.error is not None:
@@ -98,5 +98,5 @@ def _answer(process: subprocess.Popen[str], limit: float) -> list[str]:
 def main() -> None:
     """Makes the calls of a file again, and writes their results beside it."""
     data = Path(sys.argv[1])
-    lines = results(Captured.from_bytes(data.read_bytes()))
+    lines = results(CapturedCalls.from_bytes(data.read_bytes()))
     data.with_suffix(f".{os.getpid()}").write_text("\n".join(lines), encoding="utf-8")

@@ -53,7 +53,7 @@ from dataflow.causes.sources import (
     kind_of,
     name_of,
 )
-from dataflow.causes.traps import BIT_GENERATOR, ForNumpy, absolute, look_through, looking_at
+from dataflow.causes.traps import BIT_GENERATOR, NumpyEntropy, absolute, look_through, looking_at
 from dataflow.execution.generators import lazy_numpy
 
 TICK_NS = 1_000_000
@@ -91,7 +91,7 @@ class Interventions:
     def fix(self, sources: Collection[str]) -> None:
         """Makes sources give the same in every process; the others give their real values."""
         self._fixed = frozenset(sources)
-        ForNumpy.install()
+        NumpyEntropy.install()
         for install in self._installers().values():
             install()
         self._replace(os, "getpid", lambda: 4242, partial(self._gives, PROCESS))
@@ -102,7 +102,7 @@ class Interventions:
         """Makes sources give something else than they do here, or than where they are fixed."""
         self._varied = frozenset(sources)
         if not self._fixed:
-            ForNumpy.install()
+            NumpyEntropy.install()
             for source, install in self._installers().items():
                 if source in self._varied:
                     install()
@@ -261,7 +261,7 @@ class Interventions:
 
         def fixed(size: int) -> bytes:
             frame = sys._getframe(1)  # identifiers and numpy's generators are sources by themselves
-            apart = frame.f_globals.get("__name__") == "uuid" or isinstance(frame.f_locals.get("self"), ForNumpy)
+            apart = frame.f_globals.get("__name__") == "uuid" or isinstance(frame.f_locals.get("self"), NumpyEntropy)
             return urandom(size) if apart or not self._gives(ENTROPY) else self._bytes(ENTROPY, size)
 
         os.urandom = fixed

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from dataflow.causes.rerun import Rerun, Setting
+from dataflow.causes.rerun import Rerun, RerunSettings
 from dataflow.causes.sources import (
     CHANCE,
     COMPILED,
@@ -35,7 +35,7 @@ MOST = 8
 _MOVED = frozenset({HEAP, COMPILED, *MOVED})
 """Sources that are changed rather than left free: they might give the same by chance."""
 
-Fire = Callable[[Setting], Rerun]
+Fire = Callable[[RerunSettings], Rerun]
 
 
 @dataclass(slots=True)
@@ -60,7 +60,7 @@ class Findings:
         return self.settled is False
 
 
-class Ladder:
+class InterventionSearch:
     """Climbs with `fire`, which re-runs the operator; `left_out` are sources that cannot be fixed here."""
 
     def __init__(self, fire: Fire, left_out: Sequence[str] = (), most: int = MOST) -> None:
@@ -69,8 +69,8 @@ class Ladder:
 
     def climb(self, repeats: bool | None) -> Findings:
         """Finds causes. `repeats`: whether verification found that it differs alike each time; None if not known."""
-        first = self._fire(Setting(log=True))
-        base = first if repeats is False else self._fire(Setting())
+        first = self._fire(RerunSettings(log=True))
+        base = first if repeats is False else self._fire(RerunSettings())
         found = Findings(first, repeats=repeats is not False and first.same(base))
         if found.repeats:
             self._find_varied(found, base)
@@ -79,13 +79,13 @@ class Ladder:
         found.reruns = self._fired
         return found
 
-    def _fire(self, setting: Setting) -> Rerun:
+    def _fire(self, setting: RerunSettings) -> Rerun:
         if self._fired == self._most:
             raise _SpentError
         self._fired += 1
         return self._fire_once(setting)
 
-    def _tried(self, setting: Setting) -> Rerun:
+    def _tried(self, setting: RerunSettings) -> Rerun:
         """Re-runs; where the process dies of what was changed, that is what came out."""
         try:
             return self._fire(setting)
@@ -96,14 +96,14 @@ class Ladder:
 
     def _find_freed(self, found: Findings) -> None:
         fixed = frozenset(CHANCE).difference(self._left_out)
-        base = self._fire(Setting(fixed))
+        base = self._fire(RerunSettings(fixed))
         seen = {source for source, _, _ in found.first.sites} | ({THREADS} if found.first.threads else set())
         seen |= base.given  # also to compiled code, past the log: `sorted(things, key=id)`
         unseen = [s for s in (HEAP, COMPILED) if s in fixed and s not in seen]
         trapped = [s for s in CHANCE if s in fixed & seen]
 
         def effect(group: Sequence[str]) -> Rerun | None:
-            made = self._tried(Setting(fixed.difference(group), _MOVED.intersection(group)))
+            made = self._tried(RerunSettings(fixed.difference(group), _MOVED.intersection(group)))
             if made.same(base):
                 found.settled = True
                 return None
@@ -113,8 +113,10 @@ class Ladder:
             """Nothing is a cause as long as the operator does not repeat with all sources fixed. Several threads may
             make the same each time, and yet not the same as one: that is no cause, either."""
             if found.settled is None:
-                found.settled = self._fire(Setting(fixed)).same(base)
-            return bool(found.settled) and (source != THREADS or not self._fire(Setting(fixed - {THREADS})).same(made))
+                found.settled = self._fire(RerunSettings(fixed)).same(base)
+            return bool(found.settled) and (
+                source != THREADS or not self._fire(RerunSettings(fixed - {THREADS})).same(made)
+            )
 
         self._search(found, [unseen, *([s] for s in trapped)], effect, confirmed)
 
@@ -122,12 +124,12 @@ class Ladder:
         seen = dict.fromkeys(source for source, _, _ in found.first.sites)
         outside = [s for s in seen if kind_of(s) in (VARIABLE, FILE, FOLDER, WORKING, LOCALE)]
         chance = [THREADS, *(s for s in CHANCE if s in MOVED)]
-        moved = self._tried(Setting(varied=frozenset(chance)))
+        moved = self._tried(RerunSettings(varied=frozenset(chance)))
         asked = [s for s in chance if s in seen or s in moved.given]
         known = {tuple(asked): moved}  # those that are not asked for have no effect
 
         def effect(group: Sequence[str]) -> Rerun | None:
-            made = known.get(tuple(group)) or self._tried(Setting(varied=frozenset(group)))
+            made = known.get(tuple(group)) or self._tried(RerunSettings(varied=frozenset(group)))
             found.left = found.left or made.left
             return None if made.same(base) else made
 

@@ -39,7 +39,7 @@ _MOMENT, _OTHER_MOMENT = "2026-01-02 03:04:05", "2027-10-11 12:13:14.567891234"
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RerunSettings:
     """The changes of a re-run: sources that are `fixed`, and `varied`. `log`: it logs what is read; `lines`: it looks
     for the line that writes into an input."""
 
@@ -78,8 +78,8 @@ class Setting:
         return {"fixed": sorted(self.fixed), "varied": sorted(self.varied), "log": self.log, "lines": self.lines}
 
     @staticmethod
-    def from_wire(values: Mapping[str, Any]) -> Setting:
-        return Setting(frozenset(values["fixed"]), frozenset(values["varied"]), values["log"], values["lines"])
+    def from_wire(values: Mapping[str, Any]) -> RerunSettings:
+        return RerunSettings(frozenset(values["fixed"]), frozenset(values["varied"]), values["log"], values["lines"])
 
 
 def _listed(sources: Sequence[str]) -> str:
@@ -123,7 +123,7 @@ def run_again(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     asked about), `modules` (of these), `incomplete`, `begin`, `most` calls, `seconds` at most, `began` (ns), `setting`.
     The answer: the fields of `Rerun`.
     """
-    setting = Setting.from_wire(request["setting"])
+    setting = RerunSettings.from_wire(request["setting"])
     places, passes = Places(request["modules"]), 1 + (MODULE in setting.varied)
     interventions, traps = Interventions(places, request["began"]), Traps(places)
     if setting.fixed:

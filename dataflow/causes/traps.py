@@ -41,7 +41,7 @@ from dataflow.causes.sources import (
     named,
 )
 from dataflow.execution.generators import lazy_numpy
-from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.execution.generators.shared_generators import CALLS_IN_PROGRESS
 
 BIT_GENERATOR: Any = bit_generator
 """The module of numpy that asks `randbits` for the entropy of generators without a seed."""
@@ -70,13 +70,13 @@ _LOOKS = {name: getattr(os, name) for name in ("stat", "lstat")}
 _ZONED = ("localtime", "strftime", "ctime", "mktime", "datetime.now", "datetime.today", "date.today")
 
 
-class ForNumpy(random.SystemRandom):
+class NumpyEntropy(random.SystemRandom):
     """Gives the entropy for numpy's generators that are made without a seed, and for nothing else."""
 
     @staticmethod
     def install() -> None:
         """Has numpy ask it rather than a generator that it shares with `secrets`."""
-        BIT_GENERATOR.randbits = ForNumpy().getrandbits
+        BIT_GENERATOR.randbits = NumpyEntropy().getrandbits
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +111,8 @@ class Traps:
 
     def set(self) -> None:
         """Begins to log, in this thread and in those to come."""
-        ForNumpy.install()
-        lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows who draws
+        NumpyEntropy.install()
+        lazy_numpy.seed_lazily(random.SystemRandom().getrandbits(32))  # its lock shows which call draws
         look_through(looking_at)
         sys.addaudithook(self._audited)
         threading.setprofile(self._called)
@@ -146,7 +146,7 @@ class Traps:
             asked = frame.f_back  # that of `look_through`
             self._note_path(local["path"], f"os.{local['name']}", asked and asked.f_back)
         elif source is ENTROPY:
-            if isinstance(local["self"], ForNumpy):
+            if isinstance(local["self"], NumpyEntropy):
                 self._note(NUMPY, "a generator without a seed", frame.f_back)
         elif source is not NUMPY or self._unseeded():
             call = {THREADS: "Thread.start", NUMPY: "np.random"}.get(source, f"uuid.{frame.f_code.co_name}")
@@ -161,7 +161,7 @@ class Traps:
             elif arg.__self__ is not random._inst or not self._unseeded():
                 return
         elif source is ENTROPY:
-            if isinstance(frame.f_locals.get("self"), ForNumpy) or frame.f_globals.get("__name__") == "uuid":
+            if isinstance(frame.f_locals.get("self"), NumpyEntropy) or frame.f_globals.get("__name__") == "uuid":
                 return  # noted as numpy's, or as an identifier
         elif source in (IDENTITY, HEAP) and not direct:
             return
@@ -177,7 +177,7 @@ class Traps:
     def _unseeded(self) -> bool:
         """Returns whether a draw from a global generator depends on more than its seed: outside of calls, or in a
         thread, whose draws mix with those of others."""
-        return AT_WORK.begun == AT_WORK.ended or threading.get_ident() != self._main
+        return CALLS_IN_PROGRESS.begun == CALLS_IN_PROGRESS.ended or threading.get_ident() != self._main
 
     def _audited(self, event: str, args: tuple[Any, ...]) -> None:
         if sys.getprofile() is None:

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dataflow.causes.ladder import MOST, Findings, Ladder
-from dataflow.causes.rerun import Rerun, Setting, fake_time, run_again
+from dataflow.causes.ladder import MOST, Findings, InterventionSearch
+from dataflow.causes.rerun import Rerun, RerunSettings, fake_time, run_again
 from dataflow.causes.sources import CHANCE, COMPILED, FILE, FOLDER, INPUT, MODULE, SOURCES, kind_of, name_of
 from dataflow.causes.traps import Site
 from dataflow.graph.model import Graph
@@ -21,9 +21,9 @@ from dataflow.records.comparison import Verification
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
-from dataflow.verification.books import Books
 from dataflow.verification.choice import accountable, env_of
 from dataflow.verification.ledger import incomplete_streams
+from dataflow.verification.record_totals import GraphRecordTotals
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.workers.processes import Call, Workers, call_workers
 
@@ -76,7 +76,7 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True)
-class Why:
+class CauseReport:
     """The answer about one operator. `refused`: the reason for which nothing was tried; `repeats`: whether its re-runs
     agree; `settled`: whether they do with all sources of chance fixed (None where that was not tried or needed).
     `cleared` sources were tried without effect; `reads` are those of chance among them, with the lines. Of each group
@@ -120,17 +120,17 @@ def why(
     stall_timeout: float = 120.0,
     workers: Workers = call_workers,
     progress: Progress = _unseen,
-) -> Why:
+) -> CauseReport:
     """Finds the causes for which an operator does not repeat, by at most `MOST` re-runs of it alone.
 
     `report`: that of verifying the recording (with `graph`, if it was verified against another). `seconds`: time for
-    the calls of one re-run; `stall_timeout`: seconds allowed without progress. `progress` is told of each re-run. An
+    the calls of one re-run; `stall_timeout`: seconds allowed without progress. `progress` is called for each re-run. An
     operator that cannot be re-run, or that makes what was recorded, is refused, with the reason.
     """
     began = time.monotonic()
     verification = next((v for v in report.operators if v.operator == operator), None)
     if refused := refusal(report, operator, verification):
-        return Why(operator, refused=refused)
+        return CauseReport(operator, refused=refused)
     assert verification is not None
     bounds = {"seconds": seconds, "stall_timeout": stall_timeout}
     alone = _Alone(path, graph, verification, **bounds, workers=workers, progress=progress)
@@ -139,14 +139,14 @@ def why(
     try:
         wrote = alone.lines() if verification.wrote else None
         if verification.first is None:
-            made = Why(operator, causes=(_cause(INPUT, wrote),), reruns=1)
+            made = CauseReport(operator, causes=(_cause(INPUT, wrote),), reruns=1)
         else:
-            ladder = Ladder(alone.fire, tuple(alone.left_out), MOST - (wrote is not None))
+            ladder = InterventionSearch(alone.fire, tuple(alone.left_out), MOST - (wrote is not None))
             made = _answer(ladder.climb(report.repeats(operator)), alone, wrote, verification, revised)
     except RunFailed as failure:
         if failure.interrupted:
             raise
-        return Why(operator, refused=f"it cannot be run again: {failure}")
+        return CauseReport(operator, refused=f"it cannot be run again: {failure}")
     return replace(made, left_out=alone.left_out, changed=changed, code_known=known, seconds=time.monotonic() - began)
 
 
@@ -166,7 +166,7 @@ def refusal(report: VerifyReport, operator: str, found: Verification | None) -> 
     return f"it repeats: {report.verdict(found)}"
 
 
-def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verification, revised: bool) -> Why:
+def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verification, revised: bool) -> CauseReport:
     """Returns the answer from an operator's findings; `revised`: it is not itself as it was recorded."""
     effective = [_cause(source, findings.first, findings.left) for source in findings.causes]
     newer = {
@@ -178,7 +178,7 @@ def _answer(findings: Findings, alone: _Alone, wrote: Rerun | None, found: Verif
     causes = [cause for cause in effective if _explains(cause, findings, newer, as_it_was=as_it_was)]
     first = [] if wrote is None else [_cause(INPUT, wrote)]
     reads = [_cause(source, findings.first) for source in findings.cleared if source in CHANCE]
-    return Why(
+    return CauseReport(
         found.operator,
         repeats=findings.repeats,
         settled=findings.settled,
@@ -226,7 +226,7 @@ class _Alone:
         with Recording(path) as recording:
             played = graph or graph_that_is_here(recording)[0]
             log = FiringLog.read(recording)
-            books = Books(log, played)
+            books = GraphRecordTotals(log, played)
             told = [each for each in played.nodes if accountable(recording, played, books, each)]
             incomplete = incomplete_streams(recording, played, books, told)
             held = recording.streams.keys() - incomplete
@@ -254,7 +254,7 @@ class _Alone:
         if not fake_time():
             self.left_out[COMPILED] = "libfaketime is not installed (pip install libfaketime)"
 
-    def fire(self, setting: Setting) -> Rerun:
+    def fire(self, setting: RerunSettings) -> Rerun:
         """Re-runs the operator in a new process. Raises `RunFailed`."""
         self._fired += 1
         self._progress(self._operator, self._fired, setting.words)
@@ -270,7 +270,7 @@ class _Alone:
 
     def lines(self) -> Rerun:
         """Re-runs the operator to find the lines that write into its inputs."""
-        return self.fire(Setting(lines=True))
+        return self.fire(RerunSettings(lines=True))
 
     def is_newer(self, file: str, found: Verification) -> bool:
         """Returns whether a file or folder was changed or put here after the operator's last call, or is not the
@@ -285,6 +285,6 @@ class _Alone:
 
 def reasons(
     path: Path, report: VerifyReport, operators: Sequence[str], graph: Graph | None = None, progress: Progress = _unseen
-) -> list[Why]:
+) -> list[CauseReport]:
     """Returns the answer for each of `operators`, or for the culprits where none are named."""
     return [why(path, report, name, graph=graph, progress=progress) for name in operators or report.culprits]

@@ -60,7 +60,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Elsewhere:
+class RemoteGraphOptions:
     """The options that name a graph of another machine."""
 
     connect: Annotated[str | None, option("--connect ENDPOINT", "Follow a graph of another machine: its --listen.")] = (
@@ -71,10 +71,10 @@ class Elsewhere:
 
 def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[..., None]:
     """Returns a command as Typer takes it: what groups options (a dataclass) is replaced by its fields."""
-    taken = [*_single(called), *(_single(Elsewhere) if elsewhere else ())]
+    taken = [*_single(called), *(_single(RemoteGraphOptions) if elsewhere else ())]
 
     def command(**given: Any) -> None:
-        where = _filled(Elsewhere, given) if elsewhere else Elsewhere()
+        where = _filled(RemoteGraphOptions, given) if elsewhere else RemoteGraphOptions()
         with friendly_errors(), _attached(where):
             _filled(called, given)
 
@@ -85,7 +85,7 @@ def _with_options(called: Callable[..., None], elsewhere: bool) -> Callable[...,
     return command
 
 
-def _attached(where: Elsewhere) -> AbstractContextManager[None]:
+def _attached(where: RemoteGraphOptions) -> AbstractContextManager[None]:
     if where.connect is None:
         return nullcontext()
     from dataflow.client.attach import elsewhere

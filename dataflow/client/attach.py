@@ -34,11 +34,11 @@ class NotRunning(LookupError):
     """No running graph matches, or several do; the message lists those that run."""
 
 
-class Lost(RuntimeError):
+class MachineUnreachable(RuntimeError):
     """A machine that runs a graph was not heard for too long; the message names it."""
 
 
-class Elsewhere:
+class RemoteEndpoint:
     """An endpoint of another machine, which is asked over one connection as long as a tool runs."""
 
     def __init__(self, endpoint: str, keys: Path | None) -> None:
@@ -66,14 +66,16 @@ class Elsewhere:
             return []
 
     def still_runs(self, found: RunningGraph) -> bool:
-        """Returns whether that run goes on, as far as is known. Raises `Lost` when that is not known for too long."""
+        """Returns whether that run goes on, as far as is known. Raises `MachineUnreachable` after a timeout."""
         if found.started in self._over:
             return False
         if answers := self._ask():
             return any(each.started == found.started for each in answers)
         silence = time.monotonic() - self._heard_at
         if silence > LOST_AFTER:
-            raise Lost(f"{self.endpoint} was not heard for {silence:.0f} s: whether {found.name} goes on is not known")
+            raise MachineUnreachable(
+                f"{self.endpoint} was not heard for {silence:.0f} s: whether {found.name} goes on is not known"
+            )
         return True
 
     def _ask(self) -> list[RunningGraph]:
@@ -91,7 +93,7 @@ class Elsewhere:
             self._bus.close()
 
 
-_elsewhere: ContextVar[Elsewhere | None] = ContextVar("elsewhere", default=None)
+_elsewhere: ContextVar[RemoteEndpoint | None] = ContextVar("elsewhere", default=None)
 
 
 def with_keys_of_tools() -> bool:
@@ -103,7 +105,7 @@ def with_keys_of_tools() -> bool:
 @contextlib.contextmanager
 def elsewhere(endpoint: str, keys: Path | None) -> Iterator[None]:
     """Looks for running graphs at an endpoint of another machine, with these keys, as long as the block runs."""
-    with contextlib.closing(Elsewhere(endpoint, keys)) as place:
+    with contextlib.closing(RemoteEndpoint(endpoint, keys)) as place:
         token = _elsewhere.set(place)
         try:
             yield
@@ -155,7 +157,7 @@ def types_of(graph: Graph) -> TypeOf:
 
 
 def still_runs(found: RunningGraph) -> bool:
-    """Returns whether that very run goes on. Raises `Lost` for one of another machine that is silent for too long."""
+    """Returns whether that very run goes on. Raises `MachineUnreachable` after a timeout of another machine."""
     if (place := _elsewhere.get()) is not None:
         return place.still_runs(found)
     return any(g.pid == found.pid and g.started == found.started for g in running())

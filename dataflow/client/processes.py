@@ -28,7 +28,7 @@ class NoAnswer(LookupError):
     """No process answered for an operator in time."""
 
 
-class Refused(ValueError):
+class RequestRejected(ValueError):
     """The process of an operator refuses a parameter; the message has the reason."""
 
 
@@ -77,7 +77,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Taker:
+class PublishTarget:
     """A source that takes messages from outside: its port, and the names of the types it takes."""
 
     port: str
@@ -125,14 +125,14 @@ class Processes:
         return {name: answers[name] for name in wanted if name in answers}
 
     def set_parameter(self, operator: str, name: str, value: Any, timeout: float) -> Any:
-        """Changes a parameter; the value as the operator took it. Raises `Refused`, `NoAnswer`."""
+        """Changes a parameter; the value as the operator took it. Raises `RequestRejected`, `NoAnswer`."""
         key = runtime_key(self._namespace, "param", operator)
         return self._answered(key, operator, {"name": name, "value": value}, timeout, "the change is made")
 
     def _answered(self, key: str, operator: str, request: Mapping[str, Any], timeout: float, then: str) -> Any:
         for said in self._until(key, request, timeout):
             if not said["ok"]:
-                raise Refused(said["error"])
+                raise RequestRejected(said["error"])
             return said["value"]
         raise NoAnswer(
             f"no answer for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
@@ -141,30 +141,30 @@ class Processes:
 
     def reload(self, operator: str, timeout: float) -> dict[str, Any]:
         """Has an operator go on with its code as it is in its files now; what its process answers (`Runner.reload`).
-        Raises `Refused`, `NoAnswer`."""
+        Raises `RequestRejected`, `NoAnswer`."""
         key = local_key(self._namespace, "reload", operator)
         return dict(self._answered(key, operator, {"reload": True}, timeout, "it is reloaded"))
 
     def files(self, operator: str, timeout: float) -> dict[str, str]:
         """The digests of the modules that an operator's code is made of, as their files are now on its machine. Raises
-        `Refused`, `NoAnswer`."""
+        `RequestRejected`, `NoAnswer`."""
         key = local_key(self._namespace, "reload", operator)
         return dict(self._answered(key, operator, {"reload": True, "files": True}, timeout, "nothing is reloaded"))
 
-    def takers(self, timeout: float) -> dict[str, Taker]:
+    def takers(self, timeout: float) -> dict[str, PublishTarget]:
         """The sources that take messages from outside, by name."""
         answers = self._bus.ask(runtime_key(self._namespace, "pub", "**"), timeout=timeout)
         said = [msgpack.unpackb(answer, raw=False) for answer in answers]
-        return {each["operator"]: Taker(each["port"], tuple(each["types"])) for each in said}
+        return {each["operator"]: PublishTarget(each["port"], tuple(each["types"])) for each in said}
 
     def publish(self, operator: str, message: Message, timeout: float) -> int:
         """Gives a message to a source that takes them from outside; returns its stamp, the event time of now where the
-        message has the stamp 0. Raises `Refused`, `NoAnswer`."""
+        message has the stamp 0. Raises `RequestRejected`, `NoAnswer`."""
         payload = encode(Envelope(Kind.MESSAGE, operator, 0, 0, message.stamp, message))
         for answer in self._bus.ask(runtime_key(self._namespace, "pub", operator), payload, timeout=timeout):
             said = msgpack.unpackb(answer, raw=False)
             if not said["ok"]:
-                raise Refused(said["error"])
+                raise RequestRejected(said["error"])
             return int(said["stamp"])
         raise NoAnswer(f"{operator!r} did not answer within {timeout:g} s: whether it has the message is not known")
 
@@ -201,5 +201,5 @@ def processes_of(found: RunningGraph) -> Iterator[Processes]:
     try:
         yield Processes(bus, found.namespace)
     finally:
-        with contextlib.suppress(BusError):  # a process that is stopped takes no leave; who asked need not wait for it
+        with contextlib.suppress(BusError):  # a process that is stopped takes no leave; the caller need not wait for it
             within(CLOSE_WITHIN, bus.close, "bus close")

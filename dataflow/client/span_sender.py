@@ -25,13 +25,13 @@ REPEATED = frozenset((429, 502, 503, 504))
 """Answers after which the specification has a request repeated."""
 
 
-class Refused(Exception):
+class SpansRejected(Exception):
     """The collector does not take these spans, and would not later on."""
 
 
 class SpanSender:
-    """Sends on a separate thread; who gives spans never waits for the collector. `write`: sends one request, and
-    returns how many of its spans were refused; it raises `OSError` where it may be repeated, `Refused` where not."""
+    """Sends on a separate thread; producers of spans never wait for the collector. `write`: sends one request, returns
+    how many of its spans were refused; it raises `OSError` where it may be repeated, `SpansRejected` where not."""
 
     def __init__(self, write: Callable[[str], int], at_most: int = AT_MOST, again_after: float = AGAIN_AFTER) -> None:
         self._write, self._at_most, self._again_after = write, at_most, again_after
@@ -82,7 +82,7 @@ class SpanSender:
         while True:
             try:
                 refused = self._write(text)
-            except Refused as error:
+            except SpansRejected as error:
                 self.reason = str(error)
             except (OSError, HTTPException) as error:
                 self.reason = _reason_of(error)
@@ -112,7 +112,7 @@ def into_file(path: Path) -> Callable[[str], int]:
         try:
             file.write(f"{text}\n")
         except OSError as error:
-            raise Refused(f"{path}: {error.strerror}") from None
+            raise SpansRejected(f"{path}: {error.strerror}") from None
         return 0
 
     return write
@@ -136,7 +136,7 @@ def to_collector(url: str) -> Callable[[str], int]:
             with error:
                 if error.code in REPEATED:
                     raise
-                raise Refused(f"{target} answers {error.code} {error.reason}") from None
+                raise SpansRejected(f"{target} answers {error.code} {error.reason}") from None
 
     return write
 

@@ -17,9 +17,19 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
-from dataflow.debugging.fired import Abandoned, Call, Fired, Made, Probe, Process, States, Through, call_of
+from dataflow.debugging.fired import (
+    Abandoned,
+    Call,
+    Probe,
+    Process,
+    RepeatedCall,
+    RepeatedOutput,
+    States,
+    Through,
+    call_of,
+)
 from dataflow.debugging.ring import MOST_BYTES as MOST_HELD
-from dataflow.debugging.ring import Held, Ring
+from dataflow.debugging.ring import CachedCall, Ring
 from dataflow.debugging.sources import Sources
 from dataflow.execution.calls import value_of
 from dataflow.execution.failure import RESTORE, OperatorFailure, readable
@@ -31,7 +41,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.recording.streams.diff import differences
-from dataflow.records.cuts import Taken, cut_record
+from dataflow.records.cuts import ResumePoint, cut_record
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
 from dataflow.records.repetition import Repetition, look_at
@@ -55,7 +65,7 @@ class DebugError(ReplayError):
 
 
 @dataclass(frozen=True, slots=True)
-class Unmade:
+class UnrepeatableCalls:
     """Calls that a search has passed by, as they cannot be made again: how many, the number of the first, and why."""
 
     count: int
@@ -110,15 +120,17 @@ class Debugger:
         self._ring = Ring(most_bytes)
         self._probe: Probe | None = None
         self._reached = -1
-        self.at: Fired | None = None
-        self.unmade: Unmade | None = None
+        self.at: RepeatedCall | None = None
+        self.unmade: UnrepeatableCalls | None = None
         """Calls that the last search (`until`, `first_difference`) has passed by; None where it made all on its way."""
         self.between: Callable[[], object] = lambda: None
         """Called behind each call that is made on the way to another; what it raises ends the way there."""
 
     # ------------------------------------------------------------------------------------------------- going
 
-    def goto(self, number: int, through: Through | None = None, touched: Callable[[], bool] = lambda: True) -> Fired:
+    def goto(
+        self, number: int, through: Through | None = None, touched: Callable[[], bool] = lambda: True
+    ) -> RepeatedCall:
         """Goes to the call of that number, counted from 0 (from the end if negative): makes it, and those that it needs
         before. One of the last calls that were made here is not made again, unless by `through`, which then makes it.
         `touched` returns whether `through` may have changed something by hand: then nothing goes on from that call.
@@ -136,7 +148,7 @@ class Debugger:
         self.at = self._fired(held)
         return self.at
 
-    def each(self, first: int, last: int, through: Through) -> Iterator[Fired]:
+    def each(self, first: int, last: int, through: Through) -> Iterator[RepeatedCall]:
         """Makes the calls from one to another by `through`, one after the other. Raises as `goto` does."""
         for number in range(first, last + 1):
             held = self._made_again(number, through) if first == last else None
@@ -146,7 +158,7 @@ class Debugger:
         """The number of the last call at or before `number` that needs none before."""
         return number if self.node.operator.stateless else max(0, self._nearest_kept(number), self._nearest(number))
 
-    def _made_on_the_way(self, number: int, through: Through | None) -> Held:
+    def _made_on_the_way(self, number: int, through: Through | None) -> CachedCall:
         """Makes a call by the records before it, going on from the last one where that lies near."""
         state = number if self.node.operator.stateless else max(self._nearest_kept(number), self._nearest(number))
         stamp = self.calls[number].stamp
@@ -163,7 +175,7 @@ class Debugger:
             self._leave()
         return held
 
-    def _made_again(self, number: int, through: Through | None) -> Held | None:
+    def _made_again(self, number: int, through: Through | None) -> CachedCall | None:
         """Makes a call from what is kept of it and of those before; None where that does not suffice."""
         stateless = self.node.operator.stateless
         way = self._ring.way_to(number, [number] if stateless else self._kept)
@@ -285,8 +297,8 @@ class Debugger:
         raise DebugError(f"{self.node.name} was not called by then: its first call is {later:.3f} s later")
 
     def until(
-        self, condition: Callable[[Fired], bool], *, first: int | None = None, last: int | None = None
-    ) -> Fired | None:
+        self, condition: Callable[[RepeatedCall], bool], *, first: int | None = None, last: int | None = None
+    ) -> RepeatedCall | None:
         """Goes on to the next call for which `condition` is true, of those from the number `first` (by default the one
         behind the call where we are) to `last`; None where none is: then `at` stays. `unmade` has those that it has
         passed by, of which nothing is known.
@@ -320,16 +332,16 @@ class Debugger:
     def _pass_by(self, number: int, behind: int) -> None:
         """Notes that a search has made none of the calls from `number` to before `behind`."""
         if number < behind:
-            was = self.unmade or Unmade(0, number, self._why_not())
+            was = self.unmade or UnrepeatableCalls(0, number, self._why_not())
             self.unmade = replace(was, count=was.count + behind - number)
 
-    def _goes_to(self, held: Held, condition: Callable[[Fired], bool]) -> bool:
+    def _goes_to(self, held: CachedCall, condition: Callable[[RepeatedCall], bool]) -> bool:
         fired = self._fired(held)
         if found := condition(fired):
             self.at = fired
         return found
 
-    def first_difference(self) -> Fired | None:
+    def first_difference(self) -> RepeatedCall | None:
         """Goes to the first call of all whose outputs or error are not the recorded ones."""
         self._leave()
         self.at = None
@@ -337,7 +349,7 @@ class Debugger:
 
     # ------------------------------------------------------------------------------------------------- again
 
-    def again(self, through: Through | None = None) -> Fired:
+    def again(self, through: Through | None = None) -> RepeatedCall:
         """Makes the call where we are once more, from the same state; `through` makes the call, if given.
 
         Raises `DebugError` where there is no call yet.
@@ -346,7 +358,7 @@ class Debugger:
             raise DebugError("no call was made yet: goto one")
         return self.goto(self.at.number, through or _plainly)
 
-    def step_into(self) -> Fired:
+    def step_into(self) -> RepeatedCall:
         """Makes the call once more under pdb, which stops at the first line of `process()` (`finish()`)."""
         name = "finish" if self.at is not None and self.at.call.kind == "finish" else "process"
         code = getattr(self.node.operator, name).__code__
@@ -445,7 +457,7 @@ class Debugger:
             self._recording, makers.values(), begin, stateless=stateless, stateful=stateful, end=end, reach=REACH
         )
 
-    def _onwards(self) -> Iterator[Held]:
+    def _onwards(self) -> Iterator[CachedCall]:
         """Makes one call after the other; yields them."""
         assert self._work is not None
         assert self._probe is not None
@@ -469,20 +481,20 @@ class Debugger:
     def _number(self, call: Call) -> int:
         return bisect.bisect_left(self.calls, (call.incarnation, call.record), key=lambda c: (c.incarnation, c.record))
 
-    def _held(self, number: int, runner: RecordedRunner, *, same: bool) -> Held:
+    def _held(self, number: int, runner: RecordedRunner, *, same: bool) -> CachedCall:
         """The call that a runner has made just now."""
         record, probe = runner.record, runner.calls
         assert record is not None
         assert isinstance(probe, Probe)
         changed = dict(runner.changed)
         if record.detail.get("injected"):
-            return Held(number, record, None, {}, None, same, changed, (None, None))
+            return CachedCall(number, record, None, {}, None, same, changed, (None, None))
         states = (probe.before, probe.after) if probe.aimed or self.node.operator.stateless else None
         if stale := isinstance(probe.raised, (BdbQuit, Abandoned)):
             probe.raised.__traceback__ = None
-        return Held(number, record, probe.firing, probe.outputs, probe.raised, same, changed, states, stale)
+        return CachedCall(number, record, probe.firing, probe.outputs, probe.raised, same, changed, states, stale)
 
-    def _take(self, held: Held, probe: Probe) -> None:
+    def _take(self, held: CachedCall, probe: Probe) -> None:
         """Keeps a call, and the state before it, if that was taken."""
         self._ring.add(held)
         if held.firing is None or probe.before is None or probe.call != held.call:
@@ -495,13 +507,13 @@ class Debugger:
     def _cut(self, call: Call, changed: Mapping[str, Any], state: bytes | None) -> FiringRecord:
         """The record by which an operator begins in front of a call."""
         place = FiringRecord(self.node.name, call.incarnation, call.record - 1, "fire", call.stamp - 1)
-        taken = Taken(again=False, at_setup={}, since=changed, state=state)
+        taken = ResumePoint(again=False, at_setup={}, since=changed, state=state)
         return cut_record(place, left_out=0, taken=taken, held=(), stamp=place.stamp)
 
-    def _fired(self, held: Held) -> Fired:
+    def _fired(self, held: CachedCall) -> RepeatedCall:
         record = held.record
         raised = held.raised
-        return Fired(
+        return RepeatedCall(
             number=held.number,
             call=held.call,
             inputs={} if held.firing is None else {n: value_of(given) for n, given in held.firing.inputs.items()},
@@ -519,7 +531,7 @@ class Debugger:
             kept=self.node.operator.spec.state,
         )
 
-    def _states(self, held: Held) -> States:
+    def _states(self, held: CachedCall) -> States:
         """The states before and after a call, which is made again if they were not taken."""
         if held.states is None:
             again = self._made_again(held.number, _plainly) or self._made_on_the_way(held.number, _plainly)
@@ -527,7 +539,7 @@ class Debugger:
         assert held.states is not None
         return held.states
 
-    def _made(self, record: FiringRecord, outputs: Mapping[str, Message]) -> Iterator[Made]:
+    def _made(self, record: FiringRecord, outputs: Mapping[str, Message]) -> Iterator[RepeatedOutput]:
         ports = self.node.outputs
         emissions = record.outputs or (None,) * len(ports)
         for (port, stream), emission in zip(ports.items(), emissions, strict=True):
@@ -535,14 +547,14 @@ class Debugger:
             if here is None and emission is None:
                 continue
             if here is not None and emission is not None and here.digest() == emission.digest:
-                yield Made(port, stream, same=True, here=here, recorded=here)
+                yield RepeatedOutput(port, stream, same=True, here=here, recorded=here)
                 continue
             then = None
             if emission is not None:
                 place = record.incarnation, emission.seq
                 then = recorded_message(self._recording, stream, place, emission.stamp)
             fields = () if here is None or then is None else tuple(differences(then, here, None)[0])
-            yield Made(port, stream, same=False, here=here, recorded=then, fields=fields)
+            yield RepeatedOutput(port, stream, same=False, here=here, recorded=then, fields=fields)
 
     def _why_not(self) -> str:
         """Returns why the calls behind the last one that was made cannot be."""

@@ -36,7 +36,7 @@ class Call(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class RepeatedOutput:
     """Holds what came out of one port: now (`here`), and in the recorded run. `fields` differ."""
 
     port: str
@@ -48,7 +48,7 @@ class Made:
 
 
 @dataclass(frozen=True, slots=True)
-class Fired:
+class RepeatedCall:
     """A call that was made again. `number` counts the operator's calls from 0.
 
     `inputs`: by name what `process()` was given, a message, None, a tuple, or a dict by stream. `packed` gives the
@@ -59,7 +59,7 @@ class Fired:
     number: int
     call: Call
     inputs: Mapping[str, Any]
-    made: tuple[Made, ...]
+    made: tuple[RepeatedOutput, ...]
     packed: Callable[[], States]
     error: str | None
     recorded_error: str | None

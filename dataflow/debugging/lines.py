@@ -20,7 +20,7 @@ _ENGINE = Path(__file__).resolve().parent.parent
 _STANDARD = Path(sysconfig.get_path("stdlib")).resolve()
 
 
-class Spot(NamedTuple):
+class CodePosition(NamedTuple):
     """A place in a call: the beginning of a line for the time of that number, from 1. It stays where other calls have
     filled caches, which a count of all lines does not."""
 
@@ -55,10 +55,10 @@ class Lines:
         finally:
             sys.settrace(before)
 
-    def spot(self, frame: FrameType) -> Spot:
+    def spot(self, frame: FrameType) -> CodePosition:
         """Returns the place where a frame has just begun a line."""
         place = frame.f_code.co_filename, frame.f_lineno
-        return Spot(*place, self._times[place])
+        return CodePosition(*place, self._times[place])
 
     def _entered(self, frame: FrameType, event: str, arg: Any) -> Any:
         code = frame.f_code

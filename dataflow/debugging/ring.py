@@ -20,7 +20,7 @@ MOST_BYTES = 2**29
 
 
 @dataclass(slots=True)
-class Held:
+class CachedCall:
     """A call that was made here: its record, what it was given, what came out. `firing` is None where a fault was tried
     out in place of the call.
 
@@ -58,15 +58,15 @@ class Ring:
 
     def __init__(self, most_bytes: int = MOST_BYTES) -> None:
         self._most_bytes = most_bytes
-        self._held: dict[int, Held] = {}
+        self._held: dict[int, CachedCall] = {}
         self._holders: Counter[bytes] = Counter()
         self._nbytes = 0
 
-    def get(self, number: int) -> Held | None:
+    def get(self, number: int) -> CachedCall | None:
         """The call of that number, if it is kept."""
         return self._held.get(number)
 
-    def add(self, held: Held) -> None:
+    def add(self, held: CachedCall) -> None:
         """Keeps a call, in place of what was kept of it; lets the oldest ones go."""
         self.drop(held.number)
         self._held[held.number] = held
@@ -86,10 +86,10 @@ class Ring:
         for held in self._held.values():
             held.stale = True
 
-    def way_to(self, number: int, states: Collection[int]) -> Sequence[Held]:
+    def way_to(self, number: int, states: Collection[int]) -> Sequence[CachedCall]:
         """The calls from the last one at or before `number` in front of which a state is known, to `number`; empty
         where one of them is not kept."""
-        way: list[Held] = []
+        way: list[CachedCall] = []
         while (held := self._held.get(number)) is not None and held.firing is not None:
             if way and not way[-1].call.follows(held.call):
                 return ()
@@ -99,7 +99,7 @@ class Ring:
             number -= 1
         return ()
 
-    def _count(self, held: Held, by: int) -> None:
+    def _count(self, held: CachedCall, by: int) -> None:
         for message in held.messages():
             digest = message.digest()
             self._holders[digest] += by

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Call, Fired
+from dataflow.debugging.fired import Call, RepeatedCall
 from dataflow.debugging.lines import Lines, homes_of, is_own
 from dataflow.debugging.reduce import needed, smallest
 from dataflow.execution.failure import OperatorFailure
@@ -180,7 +180,7 @@ def _without(undone: Iterable[Change], texts: Mapping[str, list[str]]) -> dict[s
     return {module: "".join(lines).encode() for module, lines in found.items()}
 
 
-def _mends(recording: Recording, debugger: Debugger, fired: Fired, texts: Mapping[str, bytes]) -> bool | None:
+def _mends(recording: Recording, debugger: Debugger, fired: RepeatedCall, texts: Mapping[str, bytes]) -> bool | None:
     """Returns whether the call gives what was recorded with other texts of modules."""
     node, here = debugger.node, debugger.node.operator
     try:
@@ -201,7 +201,7 @@ def _with_defaults(node: Node, before: type[Operator]) -> Node:
     return replace(node, params=validate_parameters(node.operator, given).model_dump(mode="json"))
 
 
-def _raised(fired: Fired, homes: tuple[Path, ...]) -> Place | None:
+def _raised(fired: RepeatedCall, homes: tuple[Path, ...]) -> Place | None:
     if fired.raised is None:
         return None
     frames = traceback.extract_tb(fired.raised.__traceback__)

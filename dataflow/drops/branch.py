@@ -8,8 +8,8 @@ from typing import Any
 
 from dataflow.drops.losses import Loss
 from dataflow.drops.player import MOST_BYTES, PlayedCalls, Player
-from dataflow.execution.admission import Arrival, Promise
-from dataflow.execution.driver import Driver, HandOver
+from dataflow.execution.admission import Arrival, Frontier
+from dataflow.execution.driver import Driver, LocalEmitter
 from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.runner import OperatorRunner
 from dataflow.graph.model import Graph
@@ -118,7 +118,7 @@ class _Read:
         """Leaves it open."""
 
 
-class _Keeping(HandOver):
+class _Keeping(LocalEmitter):
     """Keeps the records."""
 
     def __init__(self, driver: Driver) -> None:
@@ -136,7 +136,7 @@ class HeldRunner(OperatorRunner):
     its stream waits as well.
     """
 
-    def __init__(self, graph: Graph, player: Player, emitter: HandOver, held: Sequence[Loss]) -> None:
+    def __init__(self, graph: Graph, player: Player, emitter: LocalEmitter, held: Sequence[Loss]) -> None:
         super().__init__(
             player.node, emitter, static=graph.static, seed=graph.seed, operator=player.operator.shell, lossy=True
         )
@@ -155,13 +155,13 @@ class HeldRunner(OperatorRunner):
 
     def advance(self, stream: str, frontier: int) -> None:
         if stream in self._holds:
-            self._take(stream, Promise(frontier))
+            self._take(stream, Frontier(frontier))
         else:
             super().advance(stream, frontier)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         if stream in self._holds:
-            self._take(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+            self._take(stream, Frontier(NEVER if final_stamp is None else final_stamp, True, reason))
         else:
             super().end(stream, final_stamp, reason)
 
@@ -173,7 +173,7 @@ class HeldRunner(OperatorRunner):
 
     def _pass_on(self, stream: str, arrival: Arrival) -> bool:
         """Gives it to the aligner; False where that has to wait."""
-        if isinstance(arrival, Promise):
+        if isinstance(arrival, Frontier):
             if arrival.ends:
                 super().end(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
             else:

@@ -9,7 +9,7 @@ from typing import Any
 
 import xxhash
 
-from dataflow.drops.distant import operator_of
+from dataflow.drops.operator_process import operator_of
 from dataflow.execution.calls import Calls, Place
 from dataflow.execution.effects.journal import EFFECTS
 from dataflow.graph.model import Graph, Node
@@ -28,7 +28,7 @@ MOST_GIVEN = 2**32
 _NEW = b""
 
 
-class Given:
+class ReplayedFirings:
     """Firings that an operator with a state was given in one replay. `pasts` are those behind each, before them `_NEW`.
 
     Of firings before a state that is kept only the stamps are left; `nbytes`: of the inputs of the others.
@@ -77,7 +77,7 @@ class Player:
             self.statics, self._at = self.operator.setup(), _NEW
         return self.statics
 
-    def bring(self, given: Given) -> None:
+    def bring(self, given: ReplayedFirings) -> None:
         """Brings the operator to behind what it was given."""
         pasts, firings = given.pasts, given.firings
         if self.stateless or self._at == pasts[-1]:
@@ -95,7 +95,7 @@ class Player:
         for k in range(near, len(pasts) - 1):
             self._call(firings[k], firings[k - 1].stamp if k else NEVER, pasts[k + 1])
 
-    def process(self, given: Given, firing: Firing) -> Mapping[str, Message]:
+    def process(self, given: ReplayedFirings, firing: Firing) -> Mapping[str, Message]:
         """Makes the firing behind those, or gives what it gave in another replay; `given` is carried on.
 
         Raises what the operator raises, and `ReplayError` where too much would have to be kept.
@@ -153,7 +153,7 @@ class PlayedCalls(Calls):
     def __init__(self, player: Player) -> None:
         super().__init__(player.node, player.operator.shell, 0)
         self._player = player
-        self._given = Given()
+        self._given = ReplayedFirings()
 
     def setup(self) -> dict[str, Message]:
         return dict(self._player.set_up())

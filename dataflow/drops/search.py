@@ -45,7 +45,7 @@ class NothingLost(DropsError):
     """Raised where no message was lost, or late."""
 
 
-class Worse:
+class FailureCondition:
     """An expression that is true of figures that are bad, such as "ate_rmse_m > 0.05" or "abs(end_error_m) > 1". It may
     call `FUNCTIONS`. Raises SyntaxError.
 
@@ -179,7 +179,7 @@ class Drops:
         self._records = {name: list(self._log.ordered(self.graph.nodes[name])) for name in names}
         if not any(record.kind == "finish" for records in self._records.values() for record in records):
             raise DropsError("no figures are recorded: the run was ended before its operators' finish(), which sums up")
-        self.worse = Worse(worse, self._recorded)
+        self.worse = FailureCondition(worse, self._recorded)
         self.replays = 0
         self._known: dict[frozenset[Loss], Figures | OperatorFailure | ReplayError] = {}
         """By what was undone, what a replay gave."""

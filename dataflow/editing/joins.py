@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
-from dataflow.records.cuts import Held, cut_record, held_by, taken_by
+from dataflow.records.cuts import OrphanedMessage, cut_record, held_by, taken_by
 from dataflow.records.firing import WITHHELD, FiringRecord
 from dataflow.records.order import Place
 
@@ -24,7 +24,7 @@ class Joined:
     streams: Sequence[str]
 
     def __iter__(self) -> Iterator[FiringRecord]:
-        held: dict[tuple[str, int, int], Held] = {}
+        held: dict[tuple[str, int, int], OrphanedMessage] = {}
         for part in self.parts:
             for record in part:
                 held |= {(h.stream, *h.place): h for h in held_by(record)}
@@ -49,7 +49,7 @@ def _place(record: FiringRecord) -> Place:
     return record.incarnation, record.index
 
 
-def holding(records: Iterable[FiringRecord], held: Sequence[Held]) -> Iterator[FiringRecord]:
+def holding(records: Iterable[FiringRecord], held: Sequence[OrphanedMessage]) -> Iterator[FiringRecord]:
     """The records, with one that accounts for messages whose own are missing, in place of what others said of them."""
     lists = [list(message) for message in held]
     last: FiringRecord | None = None

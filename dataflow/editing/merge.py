@@ -14,7 +14,7 @@ import numpy as np
 
 from dataflow.editing.joins import Joined
 from dataflow.editing.part import Reading, as_stored, copy_messages, graph_of, kept_stamps, makers_of
-from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.report import Watch, WrittenFile, unwatched
 from dataflow.editing.rolling import once
 from dataflow.editing.spool import Spool
 from dataflow.recording import Recorded, Recording
@@ -41,7 +41,7 @@ def merge(
     compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
-) -> Edited:
+) -> WrittenFile:
     """Writes what all of `origins` hold into one file.
 
     Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
@@ -50,7 +50,7 @@ def merge(
     (`_take_over`). Files without a message whose writer died are passed over. Raises `RecordingError` for names
     that clash.
     """
-    done = Edited(str(out))
+    done = WrittenFile(str(out))
     prefixes = [*prefixes, *[""] * (len(origins) - len(prefixes))]
     if bare := [origin for origin in origins if holds_nothing(origin.file)]:
         done.notes += [f"{origin.path} {NOTHING_IN_IT}" for origin in bare]
@@ -99,7 +99,7 @@ def _is_fact(origin: Origin, name: str) -> bool:
 
 
 def _take_over(
-    copy: Copy, origins: Sequence[Origin], labels: Sequence[str], done: Edited, *, joined: bool = False
+    copy: Copy, origins: Sequence[Origin], labels: Sequence[str], done: WrittenFile, *, joined: bool = False
 ) -> None:
     """Writes the attachments of all files, and their metadata records but for those that describe the first one's run.
 
@@ -135,7 +135,9 @@ def _take_over(
         _note_renamed("metadata", origin, [name for name, _ in listed], chosen, done)
 
 
-def _note_renamed(what: str, origin: Origin, names: Sequence[str], chosen: Sequence[str | None], done: Edited) -> None:
+def _note_renamed(
+    what: str, origin: Origin, names: Sequence[str], chosen: Sequence[str | None], done: WrittenFile
+) -> None:
     for name, given in zip(names, chosen, strict=True):
         if given not in (name, None):
             done.notes.append(
@@ -180,7 +182,7 @@ def _joined_records(origins: Sequence[Origin]) -> Records:
     }
 
 
-def _joined_metadata(origins: Sequence[Origin], done: Edited, *, left_out: bool) -> dict[str, dict[str, str]]:
+def _joined_metadata(origins: Sequence[Origin], done: WrittenFile, *, left_out: bool) -> dict[str, dict[str, str]]:
     """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there, and
     no calls are `left_out`."""
     metadata = {n: dict(values) for o in origins for n, values in o.metadata.items() if _is_fact(o, n)}
@@ -264,7 +266,7 @@ def _refuse_clashes(origins: Sequence[Origin], prefixes: Sequence[str]) -> None:
         )
 
 
-def _tell_clocks(origins: Sequence[Origin], done: Edited) -> None:
+def _tell_clocks(origins: Sequence[Origin], done: WrittenFile) -> None:
     """Prints when each was recorded, and that streams of different times or clocks do not meet."""
     spans = [(origin, span) for origin in origins if (span := origin.span()) is not None]
     for origin, (first, last) in spans:
@@ -278,7 +280,7 @@ def _tell_clocks(origins: Sequence[Origin], done: Edited) -> None:
             )
 
 
-def _tell_runs(origins: Sequence[Origin], prefixes: Sequence[str], done: Edited) -> None:
+def _tell_runs(origins: Sequence[Origin], prefixes: Sequence[str], done: WrittenFile) -> None:
     left_out = [o.path.name for k, o in enumerate(origins) if (k or prefixes[0]) and o.of_kind(Kind.FIRINGS)]
     if left_out:
         done.notes.append(f"of {', '.join(left_out)}: streams alone, without graph, firing records and log")

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from dataflow.editing.key_frames import key_frames
-from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.report import Watch, WrittenFile, unwatched
 from dataflow.editing.spans import RunRecords, Span, SpanRecords, Stamps
 from dataflow.editing.spool import Spool
 from dataflow.graph import GraphError
@@ -127,14 +127,14 @@ def write_part(
     compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
-) -> Edited:
+) -> WrittenFile:
     """Writes a part of `origin` into a separate file. `firings`: those of `origin`. Raises `RecordingError`."""
     if firings is None:
         with Firings(origin) as read:
             return write_part(
                 origin, part, out, firings=read, compression=compression, overwrite=overwrite, watch=watch
             )
-    done = Edited(str(out))
+    done = WrittenFile(str(out))
     origin.lost.clear()
     part = decodable([origin], part, done)
     chosen = _chosen(origin, part, firings, done)
@@ -159,7 +159,7 @@ def write_part(
     return done
 
 
-def decodable(origins: Sequence[Origin], part: Part, done: Edited) -> Part:
+def decodable(origins: Sequence[Origin], part: Part, done: WrittenFile) -> Part:
     """Returns the part from the key frames on with which the video in it can be decoded; notes that in `done`."""
     if part.start is None or part.bare or part.spans:
         return part
@@ -218,7 +218,7 @@ def keeps_state(node: Node) -> bool:
         return True
 
 
-def _chosen(origin: Origin, part: Part, firings: Firings, done: Edited) -> SpanRecords | None:
+def _chosen(origin: Origin, part: Part, firings: Firings, done: WrittenFile) -> SpanRecords | None:
     """The firing records of the part; None where there are none, or they cannot be kept."""
     if not origin.own or not origin.of_kind(Kind.FIRINGS):
         return None
@@ -274,7 +274,7 @@ def latched(origin: Origin, topic: str) -> bool:
     return not origin.own and any(is_latched(topic, text) for text in profiles)
 
 
-def _describe(origin: Origin, kept: Mapping[int, Mask], part: Part, done: Edited) -> None:
+def _describe(origin: Origin, kept: Mapping[int, Mask], part: Part, done: WrittenFile) -> None:
     """Counts what is kept."""
     done.streams = {name: n for name, n in sorted(origin.counts(kept).items()) if n}
     firsts, lasts = [], []

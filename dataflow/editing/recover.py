@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.editing.part import copy_messages, graph_of, outputs_of
-from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.report import Watch, WrittenFile, unwatched
 from dataflow.recording import Recording
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import DIGESTS, RECOVERED, Kind
@@ -22,7 +22,7 @@ from dataflow.records.reading import FiringLog
 
 
 @dataclass(slots=True)
-class Loss:
+class LostMessages:
     """Messages of a stream that are known to have been there, by their numbers or an index, and cannot be read.
 
     `after`: the stamp (ns) of the last saved message before the first of them; None where there is none, or it is not
@@ -35,17 +35,17 @@ class Loss:
 
 
 @dataclass(slots=True)
-class Recovered:
+class RecoveryReport:
     """Summarises what was saved into a file, and what is lost.
 
     `torn`: the broken file had no proper end; `lost_bytes`: of the unfinished record there. `damage`: for people.
     """
 
-    saved: Edited
+    saved: WrittenFile
     torn: bool
     lost_bytes: int
     damage: list[str] = field(default_factory=list)
-    lost: list[Loss] = field(default_factory=list)
+    lost: list[LostMessages] = field(default_factory=list)
 
     @property
     def whole(self) -> bool:
@@ -66,7 +66,7 @@ class Recovered:
 
 def recover(
     path: Path, out: Path, *, compression: Compression = "zstd", overwrite: bool = False, watch: Watch = unwatched
-) -> Recovered:
+) -> RecoveryReport:
     """Writes everything that can be read of `path` into a file with a proper end and an index.
 
     Chunks that fail their checksum are left out. Raises `RecordingError` for what is no MCAP file at all.
@@ -88,23 +88,23 @@ def recover(
                 copy.writer.add_metadata(RECOVERED, told)
             copy.attachments(origin)
             copy_messages(copy, origin, kept, watch)
-        saved = Edited(str(out), {n: k for n, k in sorted(origin.counts(kept).items()) if k}, out.stat().st_size)
+        saved = WrittenFile(str(out), {n: k for n, k in sorted(origin.counts(kept).items()) if k}, out.stat().st_size)
         saved.attachments = len(attached)
         lost = list(_by_numbers(origin, kept, out) if origin.own else _by_index(origin, kept))
-        return Recovered(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
+        return RecoveryReport(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
 
 
-def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[Loss]:
+def _by_index(origin: Origin, kept: Mapping[int, Mask]) -> Iterator[LostMessages]:
     """Yields the messages that an index lists in chunks that cannot be read."""
     for channel, mask in sorted(kept.items(), key=lambda item: origin.channels[item[0]].topic):
         if not mask.all():
             times = origin.entries(channel).times
             before = times[mask][times[mask] < times[~mask].min()]
             topic = origin.channels[channel].topic
-            yield Loss(topic, int((~mask).sum()), int(before.max()) if len(before) else None)
+            yield LostMessages(topic, int((~mask).sum()), int(before.max()) if len(before) else None)
 
 
-def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterator[Loss]:
+def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterator[LostMessages]:
     """The numbers that are missing in streams, up to the last one that is saved or that a firing record names."""
     found: dict[tuple[str, int], dict[int, int]] = {}
     streams = origin.of_kind(Kind.STREAM)
@@ -125,7 +125,7 @@ def _by_numbers(origin: Origin, kept: Mapping[int, Mask], saved: Path) -> Iterat
         missing = [n for n in range(first, last + 1) if n not in numbers]
         if missing:
             before = [stamp for number, stamp in numbers.items() if number < missing[0]]
-            yield Loss(stream, len(missing), max(before, default=None))
+            yield LostMessages(stream, len(missing), max(before, default=None))
 
 
 def _told(path: Path) -> dict[tuple[str, int], int]:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from dataflow.editing.recover import Loss, Recovered
-from dataflow.editing.report import Edited
+from dataflow.editing.recover import LostMessages, RecoveryReport
+from dataflow.editing.report import WrittenFile
 from dataflow.interop.salvage import salvage
 from dataflow.interop.typestores import RosType
 from dataflow.recording.errors import RecordingError
@@ -18,7 +18,7 @@ from dataflow.recording.streams.codecs import SchemaText
 _COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
 
-def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> Recovered:
+def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> RecoveryReport:
     """Saves a broken SQLite or ROS 1 bag. Raises `RecordingError` for what is neither, or holds no whole message."""
     found = salvage(path)
     topics = dict(found.topics())
@@ -44,9 +44,9 @@ def recover_bag(path: Path, out: Path, *, compression: Compression = "zstd") -> 
     saved: Counter[str] = Counter()
     for number, count in counts.items():
         saved[topics[number].name] += count
-    lost = [Loss("", found.lost, None)] if found.lost else []
-    edited = Edited(str(out), dict(sorted(saved.items())), out.stat().st_size, span)
-    return Recovered(edited, True, 0, found.notes, lost)
+    lost = [LostMessages("", found.lost, None)] if found.lost else []
+    edited = WrittenFile(str(out), dict(sorted(saved.items())), out.stat().st_size, span)
+    return RecoveryReport(edited, True, 0, found.notes, lost)
 
 
 def _defined(schema: SchemaText, encoding: str) -> SchemaText:

@@ -18,7 +18,7 @@ def unwatched(done: int, total: int) -> None:
 
 
 @dataclass(slots=True)
-class Edited:
+class WrittenFile:
     """One file that was written.
 
     `streams`: messages by stream; `span`: first and last stamp of what is not static (ns). `beyond`: messages outside
@@ -26,7 +26,7 @@ class Edited:
     repeated for it. `attachments`: how many files inside of it.
     `lost`: by stream, messages that damage has kept from being read; `lacking`: missing parts of the files
     that it was made of, whose messages are not counted anywhere. `unknown`: operators whose state at the cut is not
-    in the recording. `notes` tell what else is to be known, for people.
+    in the recording. `notes` hold what else users need to know.
     """
 
     path: str

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.editing.part import Part, copy_messages, decodable, kept_stamps, masks_of, outputs_of
-from dataflow.editing.report import Edited
+from dataflow.editing.report import WrittenFile
 from dataflow.editing.spans import RunRecords, listed
 from dataflow.editing.spool import Spool
 from dataflow.graph.model import Graph
@@ -33,13 +33,13 @@ def keep_span(
     *,
     metadata: Mapping[str, Mapping[str, str]],
     mode: int = OWNER_ONLY,
-) -> Edited:
+) -> WrittenFile:
     """Writes the span of a run whose messages lie in `files`, one after the other, and whose firing records are given.
 
     Messages that several files hold are taken once; those that no firing record names yet, since it is on its way,
     are left out. `metadata` is added to that of the files; `mode`: permissions of the new file.
     """
-    done = Edited(str(out))
+    done = WrittenFile(str(out))
     with ExitStack() as stack:
         origins = [stack.enter_context(Origin(file)) for file in files]
         part = decodable(origins, part, done)
@@ -70,7 +70,7 @@ def keep_span(
 def _told(
     records: Mapping[str, Sequence[FiringRecord]], outputs: Mapping[str, Sequence[str]]
 ) -> dict[str, tuple[int, int]]:
-    """By stream, the last incarnation that records tell of, and the last stamp in it."""
+    """By stream, the last incarnation with records, and the last stamp in it."""
     told: dict[str, tuple[int, int]] = {}
     for operator, known in records.items():
         for record in known:

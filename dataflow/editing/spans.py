@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from dataflow.editing.joins import holding
-from dataflow.records.cuts import Held, Taken, code_in, cut_record, held_by, is_known, taken_by
+from dataflow.records.cuts import OrphanedMessage, ResumePoint, code_in, cut_record, held_by, is_known, taken_by
 from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.order import Place
 from dataflow.records.reading import Repeatable
@@ -30,7 +30,7 @@ START: Place = (-1, -1)
 SEGMENT = 512
 """Records that are summed up together."""
 NEVER = -(2**63)
-UNCHANGED = Taken(again=False, at_setup={}, since={}, state=None)
+UNCHANGED = ResumePoint(again=False, at_setup={}, since={}, state=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +173,11 @@ class _Log:
         self.last, self.calls = START, 0
         self.segments: list[_Segment] = []
         self.states: list[_State] = []
-        self.parameters: list[tuple[Place, Taken]] = []
+        self.parameters: list[tuple[Place, ResumePoint]] = []
         """The changed parameters behind a record that changes them."""
-        self.held: dict[str, dict[Place, Held]] = {}
+        self.held: dict[str, dict[Place, OrphanedMessage]] = {}
         """Messages that `cut` records account for."""
-        self.apart: dict[str, dict[Place, tuple[FiringRecord, Held]]] = {}
+        self.apart: dict[str, dict[Place, tuple[FiringRecord, OrphanedMessage]]] = {}
         """Messages of records that are no calls: static ones."""
         self.scattered: set[str] = set()
         """Streams whose messages do not increase in number from record to record."""
@@ -215,7 +215,7 @@ class _Log:
         for stream, made in _emitted(record, self.streams):
             place = (record.incarnation, made.seq)
             if not call:
-                held = Held(stream, *place, made.stamp, made.digest)
+                held = OrphanedMessage(stream, *place, made.stamp, made.digest)
                 self.apart.setdefault(stream, {})[place] = record, held
                 continue
             if place <= self._newest.get(stream, START):
@@ -274,7 +274,7 @@ class _Chosen:
         """The first one that is left out again."""
         self.left_out = 0
         """Calls before those that are kept."""
-        self._held: list[Held] = []
+        self._held: list[OrphanedMessage] = []
         self._told: set[tuple[str, Place]] = set()
 
     def begin(self, bound: int, start: int) -> None:
@@ -360,7 +360,7 @@ class _Chosen:
                 if record.kind in CALLS and not self.holds((record.incarnation, record.index)):
                     for stream, made in _emitted(record, log.streams):
                         if stream in extra:
-                            held = Held(stream, record.incarnation, made.seq, made.stamp, made.digest)
+                            held = OrphanedMessage(stream, record.incarnation, made.seq, made.stamp, made.digest)
                             found[stream, held.place] = held
         kept = [h for h in found.values() if wanted(h.stream, h.incarnation, h.stamp)]
         self._held = sorted(kept, key=lambda held: (held.stream, held.place))
@@ -409,7 +409,7 @@ class _Outside:
         log = self._chosen[self._makers[stream]].log
         return place in log.apart.get(stream, ()) or place in log.held.get(stream, ())
 
-    def found(self) -> Iterator[tuple[str, Held]]:
+    def found(self) -> Iterator[tuple[str, OrphanedMessage]]:
         """The messages that are noted, by stream, as far as records account for them."""
         for stream, wanted in self._wanted.items():
             log = self._chosen[self._makers[stream]].log
@@ -424,7 +424,7 @@ class _Outside:
                     for name, made in _emitted(record, log.streams):
                         place = (record.incarnation, made.seq)
                         if name == stream and record.kind in CALLS and place in wanted:
-                            found[place] = Held(stream, *place, made.stamp, made.digest)
+                            found[place] = OrphanedMessage(stream, *place, made.stamp, made.digest)
             yield from ((stream, held) for held in found.values())
 
 
@@ -453,17 +453,17 @@ def _behind(first: FiringRecord, others: Iterable[FiringRecord]) -> Iterator[Fir
     yield from others
 
 
-def _changed(known: Taken, record: FiringRecord, *, first: bool) -> Taken:
+def _changed(known: ResumePoint, record: FiringRecord, *, first: bool) -> ResumePoint:
     """The changed parameters of an operator behind a record, of those in front of it."""
     taken = taken_by(record)
     if record.kind == "setup" and not first:
-        return Taken(True, {**known.at_setup, **known.since}, {}, None, code_in(record))
+        return ResumePoint(True, {**known.at_setup, **known.since}, {}, None, code_in(record))
     if record.kind == "param" and record.outcome == "ok":
         return known._replace(since={**known.since, record.detail["name"]: record.detail["value"]})
     return known if taken is None else taken._replace(state=None)
 
 
-def _taken_up(parameters: Taken, last: FiringRecord) -> Taken:
+def _taken_up(parameters: ResumePoint, last: FiringRecord) -> ResumePoint:
     """Parameters, and the state behind the record `last`."""
     return parameters._replace(state=last.detail["state"] if is_known(last) else None)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dataflow.editing.key_frames import key_frames
 from dataflow.editing.part import Firings, Part, write_part
-from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.report import Watch, WrittenFile, unwatched
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.mcap.packing import Compression
 from dataflow.recording.streams.copying import Origin
@@ -27,7 +27,7 @@ def split(
     compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
-) -> Iterator[Edited]:
+) -> Iterator[WrittenFile]:
     """Writes the parts, `NAME_000.mcap` and so on, into `folder`; yields what each holds.
 
     `every`: event time of a part (ns); `size`: bytes in the file that a part takes of this one, what a part holds

@@ -15,7 +15,7 @@ EventClock = Callable[[], int]
 """The event time that a device's message would be stamped with now, ns since the epoch."""
 
 
-class Promise(NamedTuple):
+class Frontier(NamedTuple):
     """A frontier of a stream, or its end."""
 
     stamp: int
@@ -23,7 +23,7 @@ class Promise(NamedTuple):
     reason: str = ""
 
 
-Arrival = Entry | Promise
+Arrival = Entry | Frontier
 """One thing that a stream said."""
 
 
@@ -50,10 +50,10 @@ class AdmissionQueue:
         self._messages[stream] += 1
         self._queues[stream].append(entry)
 
-    def promise(self, stream: str, promise: Promise) -> None:
+    def promise(self, stream: str, promise: Frontier) -> None:
         """Takes a frontier or an end, which holds all that a frontier right before it did."""
         queue = self._queues[stream]
-        if not promise.ends and queue and isinstance(last := queue[-1], Promise) and not last.ends:
+        if not promise.ends and queue and isinstance(last := queue[-1], Frontier) and not last.ends:
             queue.pop()
         queue.append(promise)
 
@@ -105,7 +105,7 @@ class AdmissionQueue:
 
 
 def _is_end(arrival: Arrival) -> bool:
-    return isinstance(arrival, Promise) and arrival.ends
+    return isinstance(arrival, Frontier) and arrival.ends
 
 
 def dropped(input: str, stream: str, entry: Entry, reason: DropReason) -> Drop:
@@ -113,7 +113,7 @@ def dropped(input: str, stream: str, entry: Entry, reason: DropReason) -> Drop:
     return Drop(input, stream, entry.stamp, entry.seq, entry.incarnation, reason)
 
 
-class Patience:
+class WaitLimits:
     """Measures how long a decision has waited, and which inputs it need not wait for any longer.
 
     A decision waits from when it came up, and never before event time has reached its stamp: a tick that lies ahead

@@ -20,7 +20,7 @@ from dataflow.execution.effects.journal import Journal
 from dataflow.execution.failure import RAISED, RESTORE, OperatorFailure
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
-from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.execution.generators.shared_generators import CALLS_IN_PROGRESS
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.execution.threads import limit_threads_again
 from dataflow.graph.model import Node
@@ -60,7 +60,7 @@ class Calls:
 
     def _set_up(self, when: str, *steps: Callable[[], object]) -> dict[str, Message]:
         try:
-            with AT_WORK.call(self.node.name, NEVER):
+            with CALLS_IN_PROGRESS.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
                 self.operator.journal_effects(self._effect)
                 for step in steps:
@@ -72,9 +72,9 @@ class Calls:
     def process(self, firing: Firing) -> dict[str, Message]:
         """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
         operator, effects, stamp = self.operator, self.effects, firing.stamp
-        AT_WORK.fires = True
-        AT_WORK.operator, AT_WORK.stamp = self.node.name, stamp
-        AT_WORK.begun += 1
+        CALLS_IN_PROGRESS.fires = True
+        CALLS_IN_PROGRESS.operator, CALLS_IN_PROGRESS.stamp = self.node.name, stamp
+        CALLS_IN_PROGRESS.begun += 1
         try:
             seed = FiringSeed((self._seeded_by, stamp))
             seed_generators(seed, self.version)
@@ -97,18 +97,18 @@ class Calls:
         finally:
             self._firing = None
             LOADS.seed = None
-            AT_WORK.ended += 1
+            CALLS_IN_PROGRESS.ended += 1
 
     def reset(self, input: str, place: Place) -> None:
         """`on_reset()`. Raises what the operator raises."""
-        with AT_WORK.call(self.node.name, place[1]):
+        with CALLS_IN_PROGRESS.call(self.node.name, place[1]):
             self._seed_change(f"reset {input}", place)
             self.operator.on_reset(input)
 
     def parameter(self, name: str, value: Any, place: Place) -> Any:
         """Sets a parameter, which calls `on_parameter()`; its value as validated, in plain form. Raises
         `ParameterError` and what the operator raises."""
-        with AT_WORK.call(self.node.name, place[1]):
+        with CALLS_IN_PROGRESS.call(self.node.name, place[1]):
             self._seed_change(f"param {name}", place)
             self.operator.set_parameter(name, value)
             return self.operator.params.model_dump(mode="json")[name]
@@ -116,7 +116,7 @@ class Calls:
     def snapshot(self, place: Place) -> bytes | None:
         """The state, packed; None where the operator gives none. Raises `OperatorFailure`."""
         try:
-            with AT_WORK.call(self.node.name, place[1]):
+            with CALLS_IN_PROGRESS.call(self.node.name, place[1]):
                 self._seed_change("snapshot", place)
                 state = self.operator.snapshot()
                 return None if state is None else pack_state(state)
@@ -126,7 +126,7 @@ class Calls:
     def restore(self, state: bytes, place: Place) -> None:
         """Takes over a packed state. Raises `OperatorFailure`."""
         try:
-            with AT_WORK.call(self.node.name, place[1]):
+            with CALLS_IN_PROGRESS.call(self.node.name, place[1]):
                 self._seed_change("restore", place)
                 self.operator.restore(unpack_state(state))
         except RAISED as error:
@@ -134,7 +134,7 @@ class Calls:
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
         """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""
-        with AT_WORK.call(self.node.name, place[1]):
+        with CALLS_IN_PROGRESS.call(self.node.name, place[1]):
             self._seed_change("summary", place)
             return summary_of(self.operator, self.node.name)
 

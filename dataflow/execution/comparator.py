@@ -116,7 +116,7 @@ class Comparator:
         self.result.packages_changed = [f"{name} {then.get(name, '–')} -> {now[name]}" for name in changed]
 
     def differ(self, record: FiringRecord, port: str, expected: str, got: str, made: str = "") -> None:
-        """Notes one difference. `made`: what was made, where `got` does not tell all of it."""
+        """Notes one difference. `made`: what was made, where `got` does not show all of it."""
         self._differences.update(f"{record.incarnation} {record.index} {port} {made or got}\n".encode())
         self.result.differences = self._differences.hexdigest()
         if self._erred is record:

@@ -174,7 +174,7 @@ class Driver:
         return failures
 
 
-class HandOver:
+class LocalEmitter:
     """The emitter that hands what operators emit to those of the same process that take it, and to nothing else."""
 
     def __init__(self, driver: Driver) -> None:

@@ -19,8 +19,8 @@ from dataflow.execution.admission import (
     Clock,
     EventClock,
     EventTime,
-    Patience,
-    Promise,
+    Frontier,
+    WaitLimits,
     dropped,
 )
 from dataflow.execution.calls import Calls, interrupted_after
@@ -30,7 +30,7 @@ from dataflow.execution.ports import Emitter
 from dataflow.execution.protocol import Faults
 from dataflow.execution.restarts import Restarts, close_quietly
 from dataflow.execution.runner import MOST_TICKS, OperatorRunner
-from dataflow.graph.code import ReloadError, Replaced, code_now
+from dataflow.graph.code import ReloadedCode, ReloadError, code_now
 from dataflow.graph.model import Node, OperatorImportError
 from dataflow.operator import Operator, OperatorSpec
 from dataflow.records.firing import MAX_STATE_BYTES
@@ -51,7 +51,7 @@ class LiveRunner(OperatorRunner):
     """One operator in a live run. It outlives its failures as its restart policy allows.
 
     A failed operator is restarted after the back-off and goes on with what is then in its queues; its streams begin a
-    new incarnation. `on_failure` is told of every failure that is outlived.
+    new incarnation. `on_failure` is called for every failure that is outlived.
     """
 
     keeps_time = True
@@ -83,7 +83,7 @@ class LiveRunner(OperatorRunner):
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
         self._time = EventTime(event_clock or time.time_ns)
-        self.patience = Patience(node.live.wait, clock, self._time.until)
+        self.patience = WaitLimits(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
@@ -99,7 +99,7 @@ class LiveRunner(OperatorRunner):
         self._code = code_now(type(self.operator))
         """The code that it runs: a reload of another operator of the process changes what is imported, and not this."""
         self._told = True
-        """True when the aligner may have something to decide: it was told something since it had not."""
+        """True when the aligner may have something to decide: it received something since it had not."""
 
     # Counts
 
@@ -157,12 +157,12 @@ class LiveRunner(OperatorRunner):
             self._admit(stream, entry)
 
     def advance(self, stream: str, frontier: int) -> None:
-        self._promised(stream, Promise(frontier))
+        self._promised(stream, Frontier(frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._promised(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
+        self._promised(stream, Frontier(NEVER if final_stamp is None else final_stamp, True, reason))
 
-    def _promised(self, stream: str, promise: Promise) -> None:
+    def _promised(self, stream: str, promise: Frontier) -> None:
         self.wake()
         if stream in self.queue.triggers:
             self.queue.promise(stream, promise)
@@ -281,7 +281,7 @@ class LiveRunner(OperatorRunner):
         try:
             state = None if failed else self.calls.snapshot((self.records.incarnation, stamp))
             with interrupted_after(SET_UP_WITHIN):
-                code = Replaced(self.node, self._code)
+                code = ReloadedCode(self.node, self._code)
         except (OperatorFailure, OperatorImportError) as error:
             raise ReloadError(str(error)) from error
         try:

@@ -20,7 +20,7 @@ _KEPT = 16
 @dataclass(slots=True)
 class _Given:
     """A message that operators were given: by operator the input and the stamp of the first firing that had it; its
-    digest; who has written into it, if anyone."""
+    digest; which of them has written into it, if any."""
 
     message: Message
     digest: bytes

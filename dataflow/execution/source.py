@@ -13,7 +13,7 @@ from dataflow.execution.clock_correction import ClockCorrection
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.execution.generators.loading import LOADS
 from dataflow.execution.generators.seeding import change_seed, seed_generators
-from dataflow.execution.generators.shared_generators import AT_WORK, SharedGenerators, Tripwire
+from dataflow.execution.generators.shared_generators import CALLS_IN_PROGRESS, SharedGenerators, Tripwire
 from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import Emitter, OutputPorts
 from dataflow.execution.work import Work
@@ -76,7 +76,7 @@ class SourceRunner:
     def look_ahead(self) -> int | None:
         """The stamp of the next step, or None at the end. Raises `OperatorFailure`."""
         if self._next is None and not self.ended:
-            with self.work, AT_WORK.call(self.node.name, self._read):
+            with self.work, CALLS_IN_PROGRESS.call(self.node.name, self._read):
                 self._next = self.pull()
         return None if self._next is None else step_stamp(self._next)
 

@@ -22,7 +22,7 @@ _VARIABLES = (
 
 
 THREADS = (*_VARIABLES, "DATAFLOW_THREADS")
-"""Environment variables by which libraries are told their number of threads; most read them when they load."""
+"""Environment variables that set libraries' number of threads; most read them when they load."""
 
 
 def environment(threads: int) -> dict[str, str]:

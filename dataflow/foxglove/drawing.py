@@ -39,7 +39,7 @@ _FONT = 12.0
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class SchemaDrawing:
     """Drawing of messages by one of Foxglove's schemas."""
 
     proto: type[Any]
@@ -239,21 +239,21 @@ def _image(stamp: int, frame: str, encoding: str, pixels: Any) -> RawImage:
     )
 
 
-DRAWN: dict[type[messages.Message], Drawn] = {
-    messages.Detections2D: Drawn(ImageAnnotations, boxes_over),
-    messages.Keypoints2D: Drawn(ImageAnnotations, limbs_over),
-    messages.Boxes3D: Drawn(SceneUpdate, scene),
-    messages.SceneGraph: Drawn(SceneUpdate, scene_graph),
-    messages.Mesh: Drawn(SceneUpdate, surface),
-    messages.OccupancyGrid: Drawn(Grid, grid),
-    messages.CompressedDepth: Drawn(CompressedImageProto, compressed_depth),
-    messages.RelativeDepth: Drawn(RawImage, relative_depth),
-    messages.SegmentationMap: Drawn(RawImage, mask),
+DRAWN: dict[type[messages.Message], SchemaDrawing] = {
+    messages.Detections2D: SchemaDrawing(ImageAnnotations, boxes_over),
+    messages.Keypoints2D: SchemaDrawing(ImageAnnotations, limbs_over),
+    messages.Boxes3D: SchemaDrawing(SceneUpdate, scene),
+    messages.SceneGraph: SchemaDrawing(SceneUpdate, scene_graph),
+    messages.Mesh: SchemaDrawing(SceneUpdate, surface),
+    messages.OccupancyGrid: SchemaDrawing(Grid, grid),
+    messages.CompressedDepth: SchemaDrawing(CompressedImageProto, compressed_depth),
+    messages.RelativeDepth: SchemaDrawing(RawImage, relative_depth),
+    messages.SegmentationMap: SchemaDrawing(RawImage, mask),
 }
-_TRACKS_OVER, _TRACKS = Drawn(ImageAnnotations, tracks_over), Drawn(SceneUpdate, tracks)
+_TRACKS_OVER, _TRACKS = SchemaDrawing(ImageAnnotations, tracks_over), SchemaDrawing(SceneUpdate, tracks)
 
 
-def drawing_of(message: messages.Message) -> Drawn | None:
+def drawing_of(message: messages.Message) -> SchemaDrawing | None:
     """Returns how a message is drawn; None for a type that is written by its own codec."""
     if isinstance(message, messages.Tracks):
         return _TRACKS if message.positions is not None else _TRACKS_OVER

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Protocol, Self
 
 from dataflow.extras import missing_extra
-from dataflow.foxglove.drawing import Drawn, data_of, drawing_of, schema_of
+from dataflow.foxglove.drawing import SchemaDrawing, data_of, drawing_of, schema_of
 from dataflow.messages import Message
 from dataflow.recording.streams.frames import FrameTree
 
@@ -67,7 +67,7 @@ class FoxgloveServer:
         self._sdk = _sdk()
         self._topics = Topics(namespace)
         self._context = self._sdk.Context()
-        self._channels: dict[tuple[str, type[Message], Drawn | None], Any] = {}
+        self._channels: dict[tuple[str, type[Message], SchemaDrawing | None], Any] = {}
         self._newest: dict[int, tuple[Any, Message]] = {}
         self._guard = threading.Lock()
         self.shown = 0
@@ -119,7 +119,7 @@ class FoxgloveServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, key: tuple[str, type[Message], Drawn | None], message: Message) -> Any:
+    def _open(self, key: tuple[str, type[Message], SchemaDrawing | None], message: Message) -> Any:
         text, encoding = schema_of(message)
         schema = self._sdk.Schema(name=text.name, encoding=text.encoding, data=text.data)
         channel = self._sdk.Channel(key[0], schema=schema, message_encoding=encoding, context=self._context)

@@ -55,7 +55,7 @@ class Catalogue:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "operators": [Described(path, cls).to_json() for path, cls in self.operators.items()],
+            "operators": [CatalogueEntry(path, cls).to_json() for path, cls in self.operators.items()],
             "failures": [{"module": f.module, "reason": f.reason} for f in self.failures],
         }
 
@@ -129,7 +129,7 @@ def _import(name: str, failures: list[Failure]) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class CatalogueEntry:
     """One operator and the path it is used by."""
 
     use: str
@@ -154,7 +154,7 @@ class Described:
         }
 
 
-def look_up(name: str) -> Described:
+def look_up(name: str) -> CatalogueEntry:
     """The operator of an import path or of a class name, as `find`; as few modules are imported as will do."""
     if ":" in name:
         return find(Catalogue({}), name)
@@ -162,7 +162,7 @@ def look_up(name: str) -> Described:
     return find(found if found.operators else discover(), name)
 
 
-def find(catalogue: Catalogue, name: str) -> Described:
+def find(catalogue: Catalogue, name: str) -> CatalogueEntry:
     """The operator of an import path or of a class name.
 
     A path outside the catalogue is imported. Raises LookupError that names the nearest operator, or all that fit.
@@ -170,13 +170,13 @@ def find(catalogue: Catalogue, name: str) -> Described:
     operators = catalogue.operators
     fitting = [path for path in operators if path == name or path.endswith(f":{name}")]
     if len(fitting) == 1:
-        return Described(fitting[0], operators[fitting[0]])
+        return CatalogueEntry(fitting[0], operators[fitting[0]])
     if fitting:
         raise LookupError(f"several operators are called {name!r}: {', '.join(fitting)}")
     if ":" in name:
         found = find_operator(name)
         if not isinstance(found, NotFound):
-            return Described(current_path(name), found)
+            return CatalogueEntry(current_path(name), found)
         raise LookupError(f"{found.message}; {found.hint}" if found.hint else found.message)
     names = [path.partition(":")[2] for path in operators]
     hint = did_you_mean(name, names, "operators")
@@ -306,7 +306,7 @@ def table(catalogue: Catalogue) -> RenderableType:
     return Group(listed, *(Text(line, "red") for line in catalogue.failure_lines()))
 
 
-def page(described: Described) -> RenderableType:
+def page(described: CatalogueEntry) -> RenderableType:
     """One operator in full: doc, when it fires, ports, parameters and state."""
     cls, spec = described.operator, described.operator.spec
     parts: list[RenderableType] = [Text.assemble((spec.name, "bold"), "  ", (described.use, "cyan")), Text(spec.doc)]

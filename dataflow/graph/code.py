@@ -108,7 +108,7 @@ def digest_of(text: bytes) -> str:
     return hashlib.sha256(text).hexdigest()
 
 
-class Replaced:
+class ReloadedCode:
     """An operator's code, loaded again from its files."""
 
     def __init__(self, node: Node, before: Code) -> None:

@@ -52,7 +52,7 @@ class Choice:
 
 
 @dataclass(slots=True)
-class Draft:
+class OperatorDraft:
     """One operator before its inputs are wired. `inputs` follow from `choices` once it is settled what is there."""
 
     name: str
@@ -107,7 +107,7 @@ class Expansion:
     root: Table
     name: str
     namespace: str
-    drafts: list[Draft] = field(default_factory=list)
+    drafts: list[OperatorDraft] = field(default_factory=list)
     aliases: list[Alias] = field(default_factory=list)
     graph_inputs: list[tuple[str, GraphInput]] = field(default_factory=list)
     left_out: dict[str, tuple[Absence, ...]] = field(default_factory=dict)
@@ -136,9 +136,9 @@ class Scope:
 
 
 @dataclass(slots=True)
-class Wired:
+class WiredOperator:
     """A draft with the streams of its inputs; `places` holds where each was written."""
 
-    draft: Draft
+    draft: OperatorDraft
     inputs: dict[str, tuple[str, ...]]
     places: dict[tuple[str, str], Place]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataflow.recording.streams.streams import Unread
+from dataflow.recording.streams.streams import UnreadableMessages
 
 WORDS = {
     "reordered": "put in order",
@@ -31,14 +31,14 @@ class Account:
     notes: list[str] = field(default_factory=list)
     short: list[str] = field(default_factory=list)
     repaired: dict[str, dict[str, int]] = field(default_factory=dict)
-    unread: dict[str, Unread] = field(default_factory=dict)
+    unread: dict[str, UnreadableMessages] = field(default_factory=dict)
     lost: dict[str, Counter[str]] = field(default_factory=dict)
     static: dict[str, str] = field(default_factory=dict)
     doubted: dict[str, str] = field(default_factory=dict)
 
     def pass_over(self, topic: str, reason: str) -> None:
         """Counts a message that cannot be read."""
-        known = self.unread.setdefault(topic, Unread(0, reason))
+        known = self.unread.setdefault(topic, UnreadableMessages(0, reason))
         known.count += 1
 
     def lose(self, topic: str, losses: list[str]) -> None:

@@ -48,7 +48,7 @@ class Stored(NamedTuple):
 
 
 @dataclass(slots=True)
-class Lost:
+class DamageReport:
     """Messages that damage keeps from being read.
 
     - `topics`: by topic, how many, as far as they have been read; `reasons`: by topic, the first reason.
@@ -64,7 +64,7 @@ class Lost:
         self.reasons.setdefault(topic, reason)
         self.topics[topic] = max(self.topics.get(topic, 0), number)
 
-    def join(self, other: Lost) -> None:
+    def join(self, other: DamageReport) -> None:
         """Takes in what was found when the same bag was opened another time."""
         for topic, number in other.topics.items():
             self.take(topic, number, other.reasons[topic])
@@ -85,7 +85,7 @@ class Bag(Protocol):
     """Damage and oddities of the file, for people."""
     promised: Mapping[str, int]
     """Messages by topic according to the file's metadata, statistics or index; empty where none of them counts."""
-    lost: Lost
+    lost: DamageReport
     """Messages that damage keeps from being read; complete when all others have been."""
 
     @property

@@ -158,7 +158,7 @@ def _stays_back(times: Times) -> bool:
 
 def _leap(times: Times) -> int:
     """By how much (ns) the headers leap ahead of the log for good, as where a clock was set in the middle; 0 where the
-    log goes on at another pace than they do, so that it cannot tell."""
+    log goes on at another pace than they do, so that it is no evidence."""
     assert times.header is not None
     given = times.header > 0
     header, log = times.header[given], times.log[given]

@@ -138,7 +138,7 @@ NARROWING = {(Image16, Image): "16 bits become 8", (Odometry, Pose): "velocities
 
 
 def proposed(read_as: type[Message]) -> tuple[type[Message], ...]:
-    """The types that a topic read as `read_as` is played as without being told to, that one first."""
+    """The types that a topic read as `read_as` is played as by default, that one first."""
     return tuple(to for to in offers(read_as) if (read_as, to) not in TOLD)
 
 

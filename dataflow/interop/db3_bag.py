@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from dataflow.interop.bag import BagError, Topic, is_latched
 from dataflow.interop.joined_bag import BrokenFileError, SalvagedBag
-from dataflow.interop.salvage import NO_SCHEMA, DatabaseWreck, Row
+from dataflow.interop.salvage import NO_SCHEMA, DamagedDatabase, Row
 from dataflow.recording.streams.codecs import SchemaText
 
 
@@ -20,7 +20,7 @@ class Db3Bag(SalvagedBag):
     and a rollback journal (`-journal`) takes back those that were half written. Damaged ones are read page by page."""
 
     kind = "ROS 2 bag (sqlite3)"
-    _wreck = DatabaseWreck
+    _wreck = DamagedDatabase
 
     def _sound(self, file: Path, notes: list[str]) -> Database:
         database = Database(file)

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import zstandard
 
-from dataflow.interop.bag import BagError, Lost, Stored, Topic
-from dataflow.interop.salvage import Wreck
+from dataflow.interop.bag import BagError, DamageReport, Stored, Topic
+from dataflow.interop.salvage import DamagedFile
 from dataflow.interop.unpacking import unpacked_message
 from dataflow.recording.errors import RecordingError
 
@@ -24,7 +24,7 @@ Row = tuple[int, int, bytes | memoryview]
 """(log time, number of the channel, message)"""
 
 
-class Opened(Protocol):
+class OpenedFile(Protocol):
     """One file of a bag."""
 
     path: Path
@@ -33,7 +33,7 @@ class Opened(Protocol):
         """Closes it. Idempotent."""
 
 
-File = TypeVar("File", bound=Opened)
+File = TypeVar("File", bound=OpenedFile)
 
 
 class JoinedBag(Generic[File]):
@@ -46,7 +46,7 @@ class JoinedBag(Generic[File]):
 
     def __init__(self, path: Path, files: Sequence[Path], *, compressed: bool = False, strict: bool = False) -> None:
         """`compressed`: each message is a zstd frame; `strict`: damage is an error."""
-        self.path, self.lost, self.strict = path, Lost(), strict
+        self.path, self.lost, self.strict = path, DamageReport(), strict
         self.promised: Mapping[str, int] = {}
         self.files: list[File] = []
         self.closing = ExitStack()
@@ -121,7 +121,7 @@ class BrokenFileError(BagError):
         self.reason = reason
 
 
-class SoundFile(Opened, Protocol):
+class IntactFile(OpenedFile, Protocol):
     """A file whose format and index are sound, as far as they have been read."""
 
     def topics(self) -> Iterator[tuple[int, Topic]]:
@@ -131,16 +131,16 @@ class SoundFile(Opened, Protocol):
         """The messages of some topics by log time; equal ones as they were written. Raises `BrokenFileError`."""
 
 
-class SalvagedBag(JoinedBag[SoundFile | Wreck]):
+class SalvagedBag(JoinedBag[IntactFile | DamagedFile]):
     """A bag whose broken files are read record by record; opened strictly, they are an error."""
 
-    _wreck: ClassVar[type[Wreck]]
+    _wreck: ClassVar[type[DamagedFile]]
 
-    def _sound(self, file: Path, notes: list[str]) -> SoundFile:
+    def _sound(self, file: Path, notes: list[str]) -> IntactFile:
         """Opens a sound file, and adds to `notes` what is unusual about it. Raises `BrokenFileError`."""
         raise NotImplementedError
 
-    def _opened(self, file: Path, notes: list[str]) -> SoundFile | Wreck:
+    def _opened(self, file: Path, notes: list[str]) -> IntactFile | DamagedFile:
         try:
             return self._sound(file, notes)
         except BrokenFileError as error:
@@ -150,11 +150,11 @@ class SalvagedBag(JoinedBag[SoundFile | Wreck]):
         (self.lost.parts if lacks else notes).append(told)
         return wreck
 
-    def _channels(self, file: SoundFile | Wreck) -> Iterator[tuple[int, Topic]]:
+    def _channels(self, file: IntactFile | DamagedFile) -> Iterator[tuple[int, Topic]]:
         return file.topics()
 
-    def _salvaged(self, file: Path, reason: str) -> tuple[Wreck, str, bool]:
-        """A broken file, record by record; what is told of it; whether anything is known to be missing.
+    def _salvaged(self, file: Path, reason: str) -> tuple[DamagedFile, str, bool]:
+        """A broken file, record by record; the notes about it; whether anything is known to be missing.
 
         Raises `BagError` where nothing is left of it.
         """

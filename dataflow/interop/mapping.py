@@ -28,11 +28,11 @@ _SAME = {
     "extrinsics": "static",
 }
 _PLAIN = {"raw", "data", "msg", "robot", "sensor"}
-"""Words that tell nothing."""
+"""Words without information."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class SourceStream:
     """A stream that a topic may stand in for. `name`: without namespace; `needed`: something takes it that must."""
 
     stream: str
@@ -43,7 +43,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Offered:
+class AvailableTopic:
     """A topic, the message types that it can be played as (best first), and how many messages it has."""
 
     topic: str
@@ -55,7 +55,7 @@ class Offered:
 class Match:
     """A topic that stands in for a stream, as one of the stream's types."""
 
-    wanted: Wanted
+    wanted: SourceStream
     topic: str
     type: str
 
@@ -70,7 +70,7 @@ class Proposal:
 
     certain: tuple[Match, ...]
     guessed: tuple[Match, ...]
-    missing: tuple[Wanted, ...]
+    missing: tuple[SourceStream, ...]
 
     @property
     def settled(self) -> bool:
@@ -86,7 +86,7 @@ class MappingError(ValueError):
     """Raised when a mapping is invalid; the message names the word, and what would be right."""
 
 
-def propose(streams: Sequence[Wanted], topics: Sequence[Offered], given: Mapping[str, str]) -> Proposal:
+def propose(streams: Sequence[SourceStream], topics: Sequence[AvailableTopic], given: Mapping[str, str]) -> Proposal:
     """Returns what stands in for each needed stream: as `given` (stream → topic), or what fits by type and name.
 
     Certain is a topic that is the only one to fit a stream, and fits no other needed stream. Streams that nothing needs
@@ -98,7 +98,7 @@ def propose(streams: Sequence[Wanted], topics: Sequence[Offered], given: Mapping
     left = [w for w in streams if w.needed and w.stream not in given]
     fits = {w.stream: [o for o in topics if o.topic not in taken and _type(w, o)] for w in left}
     missing = [w for w in left if not fits[w.stream]]
-    open_: list[Wanted] = []
+    open_: list[SourceStream] = []
     for wanted in left:
         found = fits[wanted.stream]
         rivals = [w for w in left if w is not wanted and found and found[0] in fits[w.stream]]
@@ -120,7 +120,7 @@ def propose(streams: Sequence[Wanted], topics: Sequence[Offered], given: Mapping
     return Proposal(tuple(certain), tuple(guessed[w.stream] for w in open_), tuple(missing))
 
 
-def _given(wanted: Wanted, topic: Offered) -> Match:
+def _given(wanted: SourceStream, topic: AvailableTopic) -> Match:
     if _type(wanted, topic) is None:
         raise MappingError(
             f"{topic.topic} is read as {' or '.join(topic.types) or 'nothing'}, and {wanted.name} takes "
@@ -129,13 +129,13 @@ def _given(wanted: Wanted, topic: Offered) -> Match:
     return _match(wanted, topic)
 
 
-def _match(wanted: Wanted, topic: Offered) -> Match:
+def _match(wanted: SourceStream, topic: AvailableTopic) -> Match:
     found = _type(wanted, topic)
     assert found is not None
     return Match(wanted, topic.topic, found)
 
 
-def _type(wanted: Wanted, topic: Offered) -> str | None:
+def _type(wanted: SourceStream, topic: AvailableTopic) -> str | None:
     return next((t for t in topic.types if t in wanted.types), None)
 
 
@@ -151,7 +151,7 @@ def _likeness(stream: str, topic: str) -> float:
     return (len(a & b) + len(last)) / max(1, len(a | b) + len(last))
 
 
-def parse_map(words: Iterable[str], streams: Sequence[Wanted], topics: Sequence[str]) -> dict[str, str]:
+def parse_map(words: Iterable[str], streams: Sequence[SourceStream], topics: Sequence[str]) -> dict[str, str]:
     """Returns stream → topic of words such as `/camera/color/image_raw=camera/image`.
 
     Streams are named with or without the namespace. Raises `MappingError`.

@@ -39,7 +39,7 @@ def open_bag(path: Path, *, strict: bool = False) -> Bag:
 
 
 def _timeless(bag: Bag) -> list[str]:
-    """A note where all messages have one log time, so that log times tell nothing."""
+    """A note where all messages have one log time, so that log times show nothing."""
     held = [topic for topic in bag.topics.values() if topic.count and topic.first is not None]
     times = {time for topic in held for time in (topic.first, topic.last)}
     if sum(topic.count for topic in held) < 2 or len(times) > 1:

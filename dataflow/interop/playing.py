@@ -10,9 +10,9 @@ from dataflow.graph.model import Graph
 from dataflow.interop.bag import Bag, BagError, is_static
 from dataflow.interop.clocks import Choice
 from dataflow.interop.conversions import offers, proposed
-from dataflow.interop.mapping import MappingError, Offered, Proposal, Wanted, parse_map, propose
+from dataflow.interop.mapping import AvailableTopic, MappingError, Proposal, SourceStream, parse_map, propose
 from dataflow.interop.opening import open_bag
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.streams import BagStreams, MappedTopic
 from dataflow.interop.topics import Reading, is_known
 from dataflow.messages import CompressedDepth, DepthImage, Image, Image16, Message, Transforms
 from dataflow.messages.depth_units import MILLIMETRES
@@ -23,15 +23,15 @@ class Matching:
     """The streams of a graph's sources, the topics of a bag, and what is proposed."""
 
     path: Path
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[SourceStream, ...]
     readings: tuple[Reading, ...]
     proposal: Proposal
 
-    def played(self) -> dict[str, Played]:
+    def played(self) -> dict[str, MappedTopic]:
         """Stream → what stands in for it. Raises `MappingError` where the proposal is not settled."""
         if not self.proposal.settled:
             raise MappingError(self.explanation())
-        return {m.wanted.stream: Played(m.topic, m.type, m.wanted.static) for m in self.proposal.matches}
+        return {m.wanted.stream: MappedTopic(m.topic, m.type, m.wanted.static) for m in self.proposal.matches}
 
     def options(self) -> list[str]:
         """The proposal as words of `--map`."""
@@ -53,14 +53,14 @@ class Matching:
         return "\n".join(lines)
 
 
-def wanted_streams(graph: Graph) -> tuple[Wanted, ...]:
+def wanted_streams(graph: Graph) -> tuple[SourceStream, ...]:
     """The streams of a graph's sources, and whether an operator cannot do without."""
     found = []
     for node in graph.sources():
         for stream in node.outputs.values():
             declared = graph.streams[stream]
             needed = any(consumer.input_port(port).required for consumer, port in graph.consumers(stream))
-            found.append(Wanted(stream, graph.relative(stream), declared.types, declared.static, needed))
+            found.append(SourceStream(stream, graph.relative(stream), declared.types, declared.static, needed))
     return tuple(found)
 
 
@@ -77,7 +77,9 @@ def match(path: Path, graph: Graph, words: Sequence[str]) -> Matching:
         if reading.topic.name in given.values() and not reading.playable:
             raise MappingError(f"{path}: topic {reading.topic.name} cannot be played: {reading.reason}")
     offered = [
-        Offered(r.topic.name, _types(r, r.topic.name in given.values()), r.topic.count) for r in readings if r.playable
+        AvailableTopic(r.topic.name, _types(r, r.topic.name in given.values()), r.topic.count)
+        for r in readings
+        if r.playable
     ]
     return Matching(path, wanted, readings, propose(wanted, offered, given))
 
@@ -99,8 +101,8 @@ def play(
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
-    """Wishes for the reading of a bag: `depth`, topics of 16-bit depth, be it that their messages do not say so, and
+class BagReadOptions:
+    """Options for reading a bag: `depth`, topics of 16-bit depth, be it that their messages do not say so, and
     how many of their units a metre has; `lossy`, whether 16-bit images become 8-bit ones; `strict`, whether a message
     that cannot be read is an error."""
 
@@ -109,7 +111,7 @@ class Wishes:
     strict: bool = False
 
 
-PLAIN = Wishes()
+PLAIN = BagReadOptions()
 
 
 def readable(
@@ -117,7 +119,7 @@ def readable(
     path: Path,
     clock: Choice = "auto",
     topics: Collection[str] | None = None,
-    wishes: Wishes = PLAIN,
+    wishes: BagReadOptions = PLAIN,
     *,
     accounting: bool = False,
 ) -> BagStreams:
@@ -131,7 +133,7 @@ def readable(
     readings = readings_of(bag, topics)
     found = [r for r in readings if r.playable and r.topic.count]
     played = {
-        r.topic.name: Played(
+        r.topic.name: MappedTopic(
             r.topic.name,
             _wished(r, wishes).SCHEMA,
             r.read_as is Transforms and is_static(r.topic.name),
@@ -149,7 +151,7 @@ def readable(
     return streams
 
 
-def _wished(reading: Reading, wishes: Wishes) -> type[Message]:
+def _wished(reading: Reading, wishes: BagReadOptions) -> type[Message]:
     assert reading.read_as is not None
     if reading.topic.name in wishes.depth and reading.read_as not in (DepthImage, CompressedDepth):
         if DepthImage not in offers(reading.read_as):

@@ -15,7 +15,7 @@ from dataflow.interop.clocks import I64, Repair, Times
 
 
 @dataclass(slots=True)
-class Found:
+class TopicEntries:
     """The entries of one topic in the order of the log: a message, or a part of one."""
 
     messages: array[int] = field(default_factory=lambda: array("q"))
@@ -60,7 +60,7 @@ class Ranking:
     def __init__(
         self,
         topics: Mapping[str, str],
-        found: Mapping[str, Found],
+        found: Mapping[str, TopicEntries],
         repairs: Mapping[str, Repair],
         start: int | None,
         end: int | None,

@@ -10,7 +10,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from dataflow.interop.bag import BagError, Lost, Stored, Topic
+from dataflow.interop.bag import BagError, DamageReport, Stored, Topic
 from dataflow.recording.streams.codecs import SchemaText
 from dataflow.recording.streams.foxglove import file_descriptor_set
 
@@ -34,7 +34,7 @@ class RerunFile:
         """Raises `BagError`."""
         self.path = path
         self.promised: Mapping[str, int] = {}
-        self.lost = Lost()
+        self.lost = DamageReport()
         self._formats: dict[str, str] = {}
         self._packets: dict[str, list[tuple[int, Any, int]]] = {}
         """(time (ns), column of samples, row) by entity."""

@@ -11,9 +11,9 @@ from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Reader, ReaderError
 
 from dataflow.interop.bag import Topic, is_latched
-from dataflow.interop.joined_bag import BrokenFileError, SalvagedBag, SoundFile
+from dataflow.interop.joined_bag import BrokenFileError, IntactFile, SalvagedBag
 from dataflow.interop.ros2_folder import absent_parts
-from dataflow.interop.salvage import Ros1Wreck, Row, Wreck
+from dataflow.interop.salvage import DamagedFile, DamagedRos1Bag, Row
 from dataflow.interop.typestores import ros_type
 from dataflow.recording.streams.codecs import SchemaText
 
@@ -23,7 +23,7 @@ class RosBag(SalvagedBag):
     is damaged, is read record by record."""
 
     kind = "ROS 1 bag"
-    _wreck = Ros1Wreck
+    _wreck = DamagedRos1Bag
 
     def __init__(self, path: Path, files: Sequence[Path], *, strict: bool = False) -> None:
         super().__init__(path, files, strict=strict)
@@ -33,7 +33,7 @@ class RosBag(SalvagedBag):
     def _sound(self, file: Path, notes: list[str]) -> Indexed:
         return Indexed(file)
 
-    def _channels(self, file: SoundFile | Wreck) -> Iterator[tuple[int, Topic]]:
+    def _channels(self, file: IntactFile | DamagedFile) -> Iterator[tuple[int, Topic]]:
         """The topics of a file, their types named as in ROS 2."""
         for identity, topic in file.topics():
             schema = topic.schema

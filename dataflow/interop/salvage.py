@@ -35,7 +35,7 @@ Row = tuple[int, int, bytes]
 """(log time, number of the topic, message)"""
 
 
-class Wreck:
+class DamagedFile:
     """The messages that are left of a broken file: their places, and what one holds when it is asked for.
 
     `encoding`: of messages; `lost`: how many lack a part, as far as that shows; `notes`: for people; `parts`: what it
@@ -102,18 +102,18 @@ class Wreck:
         self._data.close()
 
 
-def salvage(path: Path) -> Wreck:
+def salvage(path: Path) -> DamagedFile:
     """Opens a broken SQLite bag or ROS 1 bag. Raises `RecordingError` for any other file."""
     with path.open("rb") as file:
         head = file.read(SQLITE_HEADER)
     if head.startswith(SQLITE_START):
-        return DatabaseWreck(path)
+        return DamagedDatabase(path)
     if head.startswith(ROS1_START):
-        return Ros1Wreck(path)
+        return DamagedRos1Bag(path)
     raise RecordingError(f"{path} is neither a SQLite database nor a ROS 1 bag of version 2.0")
 
 
-class DatabaseWreck(Wreck):
+class DamagedDatabase(DamagedFile):
     """Pages of a database, the last ones missing or some damaged. Raises `RecordingError` without a sound header."""
 
     encoding, parts = "cdr", "pages"
@@ -278,7 +278,7 @@ _IN_FILE = -1
 """In place of a chunk: the message lies outside of chunks."""
 
 
-class Ros1Wreck(Wreck):
+class DamagedRos1Bag(DamagedFile):
     """Records of a ROS 1 bag; behind a broken one the next that is whole is looked for."""
 
     encoding = "ros1"

@@ -13,24 +13,24 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.interop.account import Account
-from dataflow.interop.bag import Bag, BagError, Lost, Stored, shortfalls
+from dataflow.interop.bag import Bag, BagError, DamageReport, Stored, shortfalls
 from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import NARROWING, convert, in_units, offers
 from dataflow.interop.opening import open_bag
-from dataflow.interop.ranking import Found, Ranking, within
+from dataflow.interop.ranking import Ranking, TopicEntries, within
 from dataflow.interop.topics import Reading
 from dataflow.interop.transform_sets import joined, other_parents, places_of
 from dataflow.messages import DepthImage, Message, MessageError, Transforms, message_type
 from dataflow.messages.depth_units import MILLIMETRES, DepthSpan
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
-from dataflow.recording.streams.streams import Unread
+from dataflow.recording.streams.streams import UnreadableMessages
 
 MAX_HELD = 1 << 30
 """Bytes of messages that wait for earlier ones, which the log has later."""
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class MappedTopic:
     """A topic that stands in for a stream: as which message type, and whether as one message, valid always.
 
     `depth_scale`: how many units of 16-bit depth a metre has (REP 118: millimetres).
@@ -46,7 +46,7 @@ class BagStreams:
     """Some topics of a bag as the streams that they stand in for (`PlayableStreams`).
 
     One pass over the bag, when it is opened, finds the times of all messages; nothing is kept of them but those.
-    `watch` is told the number of messages seen. Raises `BagError`, `RecordingError`.
+    `watch` is given the number of messages seen. Raises `BagError`, `RecordingError`.
     """
 
     metadata: Mapping[str, Mapping[str, str]] = {}
@@ -54,7 +54,7 @@ class BagStreams:
     def __init__(
         self,
         path: Path,
-        played: Mapping[str, Played],
+        played: Mapping[str, MappedTopic],
         clock: Choice = "auto",
         *,
         watch: Callable[[int], None] | None = None,
@@ -71,11 +71,11 @@ class BagStreams:
             self.account = Account(list(self._bag.notes), shortfalls(self._bag))
             self._readings = {p.topic: self._reading(p) for p in self.played.values()}
             self._readers = {topic: r.reader for topic, r in self._readings.items() if r.reader is not None}
-            self._unstamped: dict[str, Unread] = {}
+            self._unstamped: dict[str, UnreadableMessages] = {}
             self._depths: dict[str, list[npt.NDArray[np.float32]]] = {}
             self._moving = sorted({p.topic for p in self.played.values() if not p.static})
             self._found = self._scan(watch)
-            self._unstamped = {topic: Unread(u.count, u.reason) for topic, u in self.account.unread.items()}
+            self._unstamped = {topic: UnreadableMessages(u.count, u.reason) for topic, u in self.account.unread.items()}
             times = [found.times(self._bag.topics[t], self._readings[t].merges) for t, found in self._found.items()]
             self.clock: Clock = choose_clock(times, clock)
             self.repairs: Mapping[str, Repair] = {
@@ -102,7 +102,7 @@ class BagStreams:
         return False
 
     @property
-    def lost(self) -> Lost:
+    def lost(self) -> DamageReport:
         """Messages that damage keeps from being read, as far as they have been read."""
         return self._bag.lost
 
@@ -175,7 +175,7 @@ class BagStreams:
 
     # ------------------------------------------------------------------------------------------------- opening
 
-    def _reading(self, played: Played) -> Reading:
+    def _reading(self, played: MappedTopic) -> Reading:
         topic = self._bag.topics.get(played.topic)
         if topic is None:
             raise BagError(f"{self.path} has no topic {played.topic!r}; it has {', '.join(self._bag.topics) or 'none'}")
@@ -191,8 +191,8 @@ class BagStreams:
             )
         return reading
 
-    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, Found]:
-        found = {topic: Found() for topic in self._moving}
+    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, TopicEntries]:
+        found = {topic: TopicEntries() for topic in self._moving}
         for seen, stored in enumerate(self._bag.messages(self._moving), 1):
             try:
                 stamps = self._readers[stored.topic].stamps(stored.data)
@@ -303,7 +303,7 @@ class BagStreams:
             if (span := DepthSpan.of(np.concatenate(depths), 1.0)) and (doubt := span.doubt()):
                 self.account.doubted[topic] = f"{doubt}: --depth {topic}=UNITS sets the units of a metre"
 
-    def _read(self, played: Played, stored: Stored, stamp: int, part: int | None = None) -> list[Message]:
+    def _read(self, played: MappedTopic, stored: Stored, stamp: int, part: int | None = None) -> list[Message]:
         """A part of a message as the type that is played, or all of them; none where it cannot be read."""
         reader, wanted = self._readers[played.topic], message_type(played.type)
         losses: list[str] | None = [] if self._accounting else None
@@ -335,5 +335,5 @@ def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording
     """Opens a recording, or the bag that `opening` (`PlayableStreams.opening`) describes."""
     if opening is None:
         return Recording(path)
-    played = {stream: Played(*values) for stream, values in opening["played"].items()}
+    played = {stream: MappedTopic(*values) for stream, values in opening["played"].items()}
     return BagStreams(path, played, opening["clock"], strict=opening["strict"])

@@ -49,7 +49,7 @@ class Total:
 
 
 def summaries(bag: Bag, readings: Sequence[Reading]) -> list[TopicSummary]:
-    """A row for each topic; one pass over the bag where its index does not tell the times."""
+    """A row for each topic; one pass over the bag where its index lacks the times."""
     unknown = [r.topic.name for r in readings if r.topic.count and r.topic.first is None]
     times: dict[str, tuple[int, int]] = {}
     for stored in bag.messages(unknown) if unknown else ():

@@ -8,13 +8,13 @@ from functools import partial
 from itertools import islice
 from typing import Any, Protocol
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.bag import Bag, Topic
 from dataflow.interop.ros import CONVERSIONS, TRANSFORM_SETS, Convert
 from dataflow.interop.ros.clouds import point_cloud
 from dataflow.interop.ros.poses import transforms
 from dataflow.interop.ros.sensors import number
 from dataflow.interop.ros.values import time_ns
-from dataflow.interop.seen import Seen
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import Message, MessageError, Transforms
 from dataflow.recording.errors import RecordingError
@@ -72,7 +72,7 @@ class RosReader:
         try:
             if losses is None:
                 return self._convert(parsed, stamp)
-            seen = Seen(parsed)
+            seen = TrackedMessage(parsed)
             made = self._convert(seen, stamp)
             losses += seen.unread()
             return made
@@ -106,7 +106,7 @@ class TransformSetReader:
         """The transforms of the part."""
         sets = _sets(self._kind.parse(data).transforms)
         chosen = sets[part][1] if sets else []
-        return transforms(chosen if losses is None else [Seen(row, losses) for row in chosen], stamp)
+        return transforms(chosen if losses is None else [TrackedMessage(row, losses) for row in chosen], stamp)
 
 
 def _sets(rows: Any) -> list[tuple[int, list[Any]]]:

@@ -17,7 +17,7 @@ from dataflow.recording.beginnings import HEAD_BYTES, ZSTD_MAGIC, head_of
 
 
 @dataclass(slots=True)
-class Plain:
+class UnpackedFiles:
     """Files as they are, and those that were compressed as copies in a temporary folder, if there is one.
 
     `damage`: by which compressed files are not whole, for people.
@@ -33,16 +33,16 @@ class Plain:
             self.copies.cleanup()
 
 
-def unpack(files: Sequence[Path], *, strict: bool = False) -> Plain:
+def unpack(files: Sequence[Path], *, strict: bool = False) -> UnpackedFiles:
     """Returns files as they are, those that are compressed unpacked: one that is not whole, as far as it goes.
 
     Raises `BagError` for one of which nothing can be unpacked, and where it is `strict` for one that is not whole.
     """
     packed = [file for file in files if file.suffix in COMPRESSED or head_of(file).startswith(ZSTD_MAGIC)]
     if not packed:
-        return Plain(list(files))
+        return UnpackedFiles(list(files))
     folder = TemporaryDirectory(prefix="dataflow-bag-")
-    found = Plain([], folder)
+    found = UnpackedFiles([], folder)
     for file in files:
         copy = Path(folder.name) / (file.stem if file.suffix in COMPRESSED else file.name) if file in packed else file
         reason = _unpacked(file, copy) if file in packed else ""

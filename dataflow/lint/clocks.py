@@ -1,6 +1,6 @@
 """Offset and drift between the clocks of two streams that see the same turning.
 
-The turning of one stream is integrated, so that what the other should have seen in its intervals can be told for every
+The turning of one stream is integrated, so that what the other should have seen in its intervals is known for every
 shift of its timestamps: the right shift makes both most alike, by their correlation. Windows of the recording give a
 first line through shifts that change, which the whole then refines.
 """
@@ -70,7 +70,7 @@ NONE = ClockDifference(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def clock_difference(stream: Turning, reference: Turning, most: float = MOST) -> ClockDifference | None:
-    """The lateness of `stream` against `reference`; None where their turning does not tell."""
+    """The lateness of `stream` against `reference`; None where their turning does not determine it."""
     seen = _Seen(stream, reference)
     if seen.usable < FEWEST or seen.duration < SHORTEST:
         return None

@@ -1,4 +1,4 @@
-"""Checks that one device publishes on a topic: two that do are told apart by what each of them keeps."""
+"""Checks that one device publishes on a topic: two that do are distinguished by what each keeps."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 To its own machine's processes a gate is one more process, linked to them by rings. A stream passes to each other
 machine once, however many processes take it there. Control messages pass through the same pipe, behind what was sent
-before them: so, as on one machine, what a process had sent when it reported something has arrived where that is heard.
+before them: so, as on one machine, what a process had sent before a report arrives before the report.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Gate:
                 said["fields"]["sent"] += self.extra
 
     def push(self) -> None:
-        """Sends what has waited for room in the links, and static messages to who was started again."""
+        """Sends what has waited for room in the links, and static messages to restarted processes."""
         if self._fanout.quiet():
             return
         for keys, link in self._fanout.joined():

@@ -94,7 +94,7 @@ class Claims:
 
 
 class Hub:
-    """Runs the link until it is told to leave."""
+    """Runs the link until it is asked to leave."""
 
     def __init__(
         self, config: HubConfig, channel: Channel, inbox: Inbox, outgoing: Sequence[tuple[Sequence[str], Outgoing]]
@@ -144,7 +144,7 @@ class Hub:
         return lambda sample: self._inbox.put(("hello", name, sample.payload.to_bytes()))
 
     def run(self) -> None:
-        """Carries until it is told to leave."""
+        """Carries until it is asked to leave."""
         while not self._left:
             self._gate.push()
             try:

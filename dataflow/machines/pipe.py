@@ -8,8 +8,8 @@ offset of the other machine's clock is measured (as NTP does, from the exchange 
 is soon out of date may go with a beat: it overtakes the frames, and is lost with a link.
 
 What the kernel and the network have taken can no longer be overtaken, and a kernel takes megabytes, which a slow link
-needs a minute for. So no more is on its way than the link delivers in about `LATE` (`Room`), long frames go in pieces,
-and what waits, waits here.
+needs a minute for. So no more is on its way than the link delivers in about `LATE` (`SendWindow`), long frames go in
+pieces, and what waits, waits here.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Clocks:
         return min(tuple(self._exchanges), default=None)
 
 
-class Room:
+class SendWindow:
     """The bytes that may be on their way at once. Pure: times (s) are given."""
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class Room:
             self.bytes = min(IN_FLIGHT_BYTES, self.bytes + nbytes)
 
 
-class Sent(NamedTuple):
+class UnacknowledgedFrame(NamedTuple):
     """A piece that is not acknowledged."""
 
     kind: int
@@ -115,9 +115,9 @@ class Pipe:
         self._waiting: deque[tuple[bytes, bool]] = deque()
         self._waiting_bytes = 0
         self._look_beyond = 0  # bytes that wait before what waits is looked at again: much of it may not be dropped
-        self._sent: deque[Sent] = deque()
+        self._sent: deque[UnacknowledgedFrame] = deque()
         self._base, self._next = 0, 0  # numbers: of the first piece in `_sent`, and of the next one to go out (again)
-        self._room = Room()
+        self._room = SendWindow()
         self._flying: deque[float] = deque()  # when each piece from `_base` to `_next` was sent
         self._flying_bytes = 0
         self._round = 0
@@ -164,7 +164,7 @@ class Pipe:
 
     @property
     def silence(self) -> float:
-        """Seconds since the other end was heard."""
+        """Seconds since the other end last sent anything."""
         return time.monotonic() - self._heard_at
 
     @property
@@ -225,8 +225,8 @@ class Pipe:
             self._waiting_bytes -= len(frame)
             self._look_beyond = min(self._look_beyond, self._waiting_bytes + MOST_WAITING // 10)
             last = max(0, len(frame) - 1) // PIECE * PIECE
-            self._sent.extend(Sent(_PART, frame[at : at + PIECE]) for at in range(0, last, PIECE))
-            self._sent.append(Sent(_END, frame[last:]))
+            self._sent.extend(UnacknowledgedFrame(_PART, frame[at : at + PIECE]) for at in range(0, last, PIECE))
+            self._sent.append(UnacknowledgedFrame(_END, frame[last:]))
         number, self._next = self._next, self._next + 1
         kind, data = self._sent[number - self._base]
         self._flying.append(time.monotonic())

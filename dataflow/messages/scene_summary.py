@@ -1,4 +1,4 @@
-"""Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words.
+"""Scene graphs for people: of hundreds of relations the few that matter, as data and in words.
 
 The kind of a node follows from ids, relations and activities, not from names of classes: ids up to 0 are places (room,
 floor, walls, table tops) and the robot itself, as SceneGraphBuilder numbers them; agents are the nodes that act.
@@ -35,11 +35,11 @@ ROOMS = -1_000_000
 """Ids below this are rooms."""
 
 LEAST = 0.5
-"""Score from which a relation is told; of an intention any."""
+"""Score from which a relation is shown; of an intention any."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SummaryRelation:
     """A relation between two nodes, by index. `score` is 1 where the graph has none."""
 
     subject: int
@@ -50,7 +50,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class SceneSummary:
-    """The relations of a graph that are worth telling.
+    """The relations of a graph that are worth showing.
 
     - `carriers`: by node, what it stands on, lies in or sits on: one relation at most, without loops.
     - `children`: by node, the nodes that it carries.
@@ -58,14 +58,14 @@ class SceneSummary:
     - `intentions`: where agents may be going, likeliest first.
     - `agents`: the nodes that have an activity or are the subject of an `ACTING` predicate.
     - `places`: the nodes that others are in, or that only part them: room, floor, walls; not a top that carries things.
-    - `tops`: surfaces that are part of a thing, which is told in their place.
+    - `tops`: surfaces that are part of a thing, which is shown in their place.
     - `rooms`: by node of a room where there are several, the nodes that are in it.
     """
 
-    carriers: Mapping[int, Told]
+    carriers: Mapping[int, SummaryRelation]
     children: Mapping[int, Sequence[int]]
-    telling: tuple[Told, ...]
-    intentions: tuple[Told, ...]
+    telling: tuple[SummaryRelation, ...]
+    intentions: tuple[SummaryRelation, ...]
     agents: frozenset[int] = frozenset()
     places: frozenset[int] = frozenset()
     tops: frozenset[int] = frozenset()
@@ -82,7 +82,7 @@ def class_names(graph: SceneGraph) -> tuple[str, ...]:
 
 
 def summarize(graph: SceneGraph, activities: Activity | None = None, most: int = 24) -> SceneSummary:
-    """Chooses what to tell of a graph: who carries what, intentions, and at most `most` other relations.
+    """Chooses what to show of a graph: what carries what, intentions, and at most `most` other relations.
 
     `SURROUNDINGS` are left out, then the commonest predicates until few enough are left; an agent has its strongest
     relation of each kind (it faces one thing, not five).
@@ -94,7 +94,7 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
     tops = frozenset(s for s, p, o in graph.relations() if p == "part_of" and ids[s] <= 0 < ids[o])
     scores = [1.0] * len(graph.subjects) if graph.relation_scores is None else graph.relation_scores.tolist()
     every = [
-        Told(s, p, o, score)
+        SummaryRelation(s, p, o, score)
         for (s, p, o), score in zip(graph.relations(), scores, strict=True)
         if s != o and p not in SURROUNDINGS and ids[o] >= ROOMS
     ]
@@ -112,7 +112,7 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
         del counts[commonest]
         rest = [r for r in rest if r.predicate != commonest]
     rest.sort(key=lambda r: (r.subject not in agents, -r.score, r.subject, r.object))
-    told: list[Told] = []
+    told: list[SummaryRelation] = []
     for r in rest:
         before = any((r.subject, r.predicate) == (other.subject, other.predicate) for other in told)
         if not (before and r.subject in agents):
@@ -125,9 +125,9 @@ def summarize(graph: SceneGraph, activities: Activity | None = None, most: int =
     return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions), agents, places, tops, rooms)
 
 
-def _carriers(relations: Sequence[Told], tops: Collection[int]) -> dict[int, Told]:
+def _carriers(relations: Sequence[SummaryRelation], tops: Collection[int]) -> dict[int, SummaryRelation]:
     """The strongest carrier of each node, a thing before its top; a relation that would close a loop is left out."""
-    carriers: dict[int, Told] = {}
+    carriers: dict[int, SummaryRelation] = {}
     for relation in sorted(
         relations, key=lambda r: (r.object in tops, -r.score, CARRYING.index(r.predicate), r.subject, r.object)
     ):

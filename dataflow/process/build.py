@@ -16,10 +16,10 @@ from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.reach import with_makers
-from dataflow.process.config import ProcessConfig, Resumed
+from dataflow.process.config import ProcessConfig, ResumeState
 from dataflow.process.live_sources import LiveSources
 from dataflow.recording import Recording
-from dataflow.records.black_box import BlackBox, Reached
+from dataflow.records.black_box import BlackBox, OperatorProgress
 from dataflow.records.spacing import StateSpacing
 from dataflow.remote import Remote
 
@@ -129,14 +129,16 @@ def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:
     ports = {name: tuple(graph.nodes[name].outputs) for name in config.nodes}
     before = {name: config.resumed(name) for name in config.nodes}
     reached = {
-        name: Reached(r.incarnation - 1, dict(r.last), dict(r.changed), {k: (p[0], p[1]) for k, p in r.places.items()})
+        name: OperatorProgress(
+            r.incarnation - 1, dict(r.last), dict(r.changed), {k: (p[0], p[1]) for k, p in r.places.items()}
+        )
         for name, r in before.items()
         if r.incarnation
     }
     return BlackBox(descriptor, ports, reached)
 
 
-def _resume(runner: Maker, resumed: Resumed) -> None:
+def _resume(runner: Maker, resumed: ResumeState) -> None:
     if resumed.incarnation:
         runner.resume(resumed.incarnation, resumed.last, resumed.changed)
 

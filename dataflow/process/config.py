@@ -8,7 +8,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Resumed:
+class ResumeState:
     """Holds where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
     of each port, the parameters that were changed, the place (incarnation, number) of the message that each port would
     have made next, and how often it has been restarted."""
@@ -30,7 +30,7 @@ class ProcessConfig:
     by which its sources may be ahead of the graph; None: a window. `paused`: they wait until they are let go on.
     `firings`: whether a recorder takes the firing records. `live`: sources do
     not wait for the graph, and operators not for their inputs. `resume` is given to a process that takes the place of
-    one that died: for each operator, where it had got to (`Resumed`, as plain values). `warm`: the recording and the
+    one that died: for each operator, where it had got to (`ResumeState`, as plain values). `warm`: the recording and
     stamp from which on it is replayed, with the operators' states of that moment. `links_out` and `links_in`: for each
     link to and from another process the keys of its channels, after whether messages may be dropped for a consumer that
     takes nothing; their descriptors were handed down in this order. `life`: how many processes have had its place, with
@@ -57,6 +57,6 @@ class ProcessConfig:
     links_in: Sequence[Sequence[str]] = ()
     life: int = 1
 
-    def resumed(self, operator: str) -> Resumed:
+    def resumed(self, operator: str) -> ResumeState:
         """Returns where an operator had got to in the process before this one."""
-        return Resumed(**(self.resume or {}).get(operator, {}))
+        return ResumeState(**(self.resume or {}).get(operator, {}))

@@ -16,11 +16,11 @@ from typing import Any
 from dataflow.chaos.faults import TO_SOURCES, SourceFaults
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.feeds.pace import Pace
-from dataflow.execution.feeds.window import Handover, Window
+from dataflow.execution.feeds.window import TransferCounters, Window
 from dataflow.execution.restarts import Restarts
 from dataflow.execution.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
-from dataflow.process.awake import LOOK_EVERY, AwakeClock
+from dataflow.process.awake_clock import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.log_pipe import SOURCE_THREAD, tell_outlived
 from dataflow.process.streams.inbox import Inbox
@@ -42,7 +42,7 @@ class Reader:
 
     def __init__(self, owner: LiveSources, runner: SourceRunner, faults: SourceFaults, *, behind: bool) -> None:
         self.runner = runner
-        self.unread = Handover()
+        self.unread = TransferCounters()
         self.failure: OperatorFailure | None = None
         """The failure of the thread, until it has been handled."""
         self.condemned: OperatorFailure | None = None

@@ -16,7 +16,7 @@ import time
 from typing import Any, Final, TextIO
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.execution.generators.shared_generators import CALLS_IN_PROGRESS
 from dataflow.process.channel import Channel
 from dataflow.recording.streams.logs import LogLine
 
@@ -78,9 +78,9 @@ def _whereabouts() -> tuple[str, int | None]:
     thread = threading.current_thread()
     if thread.name.startswith(SOURCE_THREAD):
         return thread.name.removeprefix(SOURCE_THREAD), None
-    if AT_WORK.begun == AT_WORK.ended:
+    if CALLS_IN_PROGRESS.begun == CALLS_IN_PROGRESS.ended:
         return "", None
-    return AT_WORK.operator, AT_WORK.stamp if AT_WORK.stamp > 0 else None
+    return CALLS_IN_PROGRESS.operator, CALLS_IN_PROGRESS.stamp if CALLS_IN_PROGRESS.stamp > 0 else None
 
 
 def _say(

@@ -21,7 +21,7 @@ from dataflow.execution.feeds.pace import Pace
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.threads import limit_threads
 from dataflow.graph.model import Graph
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.build import build, open_box
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
@@ -52,7 +52,7 @@ Links = Sequence[tuple[Sequence[str], Outgoing]]
 
 
 class OperatorProcess:
-    """Runs its operators until they end, it is told to leave, or something fails."""
+    """Runs its operators until they end, it is asked to leave, or something fails."""
 
     def __init__(
         self, config: ProcessConfig, channel: Channel, inbox: Inbox, outgoing: Links = (), box: int | None = None
@@ -139,7 +139,7 @@ class OperatorProcess:
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
 
     def _await_statics(self) -> None:
-        """Waits (bounded) for the static messages that were given before this process came to be: those who made them
+        """Waits (bounded) for the static messages that were given before this process came to be: those that made them
         send them again. Raises `StreamDamaged`."""
         clock = AwakeClock()
         deadline = clock() + STATICS_WITHIN
@@ -307,7 +307,7 @@ class OperatorProcess:
 
     def _work(self) -> bool:
         """Does what there is to do, but not for long where something has arrived. True when anything was done. Nothing
-        before all processes are linked: a restarted one is sent messages before it is told what time it is."""
+        before all processes are linked: a restarted one is sent messages before it has the time."""
         if not self.orders.released:
             return False
         worked = False

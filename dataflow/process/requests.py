@@ -138,7 +138,7 @@ class Requests:
         if asked.get("reload"):
             try:
                 outcome = maker.reload()
-            except ReloadError as error:  # who asked may no longer wait
+            except ReloadError as error:  # the caller may no longer wait
                 text = "is not reloaded, the old code goes on: %s"
                 logging.getLogger(__name__).warning(text, error, extra={"operator": maker.node.name})
                 raise
@@ -203,7 +203,7 @@ def _asked(query: Any) -> dict[str, Any]:
     payload = b"" if query.payload is None else query.payload.to_bytes()
     try:
         asked = msgpack.unpackb(payload, raw=False) if payload else {}
-    except (ValueError, msgpack.UnpackException):  # who asks wrongly is told the rest
+    except (ValueError, msgpack.UnpackException):  # the answer to an invalid request has the rest
         return {}
     return asked if isinstance(asked, dict) else {}
 

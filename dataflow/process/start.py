@@ -31,7 +31,7 @@ def become_warm() -> None:
     gc.freeze()
 
 
-class Forked:
+class ForkedProcess:
     """A child of this process, with those methods of `subprocess.Popen` that its starters use."""
 
     def __init__(self, pid: int) -> None:
@@ -61,7 +61,7 @@ class Forked:
             os.kill(self.pid, signal.SIGKILL)
 
 
-Process: TypeAlias = subprocess.Popen[bytes] | Forked
+Process: TypeAlias = subprocess.Popen[bytes] | ForkedProcess
 
 
 def start(
@@ -79,7 +79,7 @@ def start(
     """
     if _fits(variables, python):
         run = importlib.import_module(module).run
-        return Forked(fork(lambda: run(words), handed, variables, None if output is None else (output, output)))
+        return ForkedProcess(fork(lambda: run(words), handed, variables, None if output is None else (output, output)))
     return subprocess.Popen(
         [python, "-P", "-m", module, *words],
         pass_fds=handed,

@@ -91,7 +91,7 @@ class Watchdog:
         return seconds
 
     def _memory_taken(self) -> int:
-        """Resident memory in bytes; as it was last known where the system does not tell."""
+        """Resident memory in bytes; as it was last known where the system does not report it."""
         try:
             self._memory = self._process.memory_info().rss
         except (psutil.Error, OSError) as error:  # too many open files, say

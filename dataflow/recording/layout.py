@@ -27,7 +27,7 @@ RECOVERED: Final = "dataflow:recovered"
 FLIGHT: Final = "dataflow:flight"
 """Of what a flight recorder kept: its triggers."""
 TOLD: Final = "dataflow:told"
-"""Of what the events of a run tell without exception, as `events`: names, by spaces."""
+"""Contents that the events of a run always cover, as `events`: names, by spaces."""
 PARAMETERS: Final = "parameter"
 """The event of a parameter that was changed."""
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})

@@ -30,7 +30,7 @@ _GENERATION, _OFFSET, _CAPACITY, _LENGTH = range(4)
 
 
 @dataclass(slots=True)
-class Reached:
+class OperatorProgress:
     """Holds where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, the
     parameters that were changed, and the place (incarnation, number) of the next message of each port."""
 
@@ -62,10 +62,10 @@ class BlackBox:
     """
 
     def __init__(
-        self, descriptor: int, ports: Mapping[str, Sequence[str]], reached: Mapping[str, Reached] | None = None
+        self, descriptor: int, ports: Mapping[str, Sequence[str]], reached: Mapping[str, OperatorProgress] | None = None
     ) -> None:
         self._descriptor, self._ports = descriptor, ports
-        self._reached = {name: Reached() for name in ports} | dict(reached or {})
+        self._reached = {name: OperatorProgress() for name in ports} | dict(reached or {})
         self._memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
         self._words = memoryview(self._memory)[:_HEADER].cast("Q")
         self._active = 0
@@ -138,11 +138,11 @@ class BlackBox:
 
 
 @dataclass(frozen=True, slots=True)
-class Remains:
+class RecoveredRecords:
     """Holds what a dead process left: its operators' latest records as batches of one, and where each had got to."""
 
     batches: Mapping[str, Sequence[bytes]]
-    reached: Mapping[str, Reached]
+    reached: Mapping[str, OperatorProgress]
 
 
 def make_black_box() -> int:
@@ -155,19 +155,21 @@ def make_black_box() -> int:
     return descriptor
 
 
-def read_black_box(descriptor: int, ports: Mapping[str, Sequence[str]]) -> Remains:
+def read_black_box(descriptor: int, ports: Mapping[str, Sequence[str]]) -> RecoveredRecords:
     """Reads what a process left that has died, or that had not begun to write."""
     batches: dict[str, list[bytes]] = {name: [] for name in ports}
-    reached = {name: Reached() for name in ports}
+    reached = {name: OperatorProgress() for name in ports}
     for kind, data in _frames(descriptor):
         if kind == _CHECKPOINT:
             for name, (incarnation, last, changed, places) in msgpack.unpackb(data).items():
-                reached[name] = Reached(incarnation, last, changed, {port: tuple(p) for port, p in places.items()})
+                reached[name] = OperatorProgress(
+                    incarnation, last, changed, {port: tuple(p) for port, p in places.items()}
+                )
             continue
         for record in decode_batch(data).records:
             batches[record.operator].append(data)
             reached[record.operator].take(record, ports[record.operator])
-    return Remains(batches, reached)
+    return RecoveredRecords(batches, reached)
 
 
 def _frames(descriptor: int) -> Iterator[tuple[int, bytes]]:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from dataflow.records.firing import CALLS, FiringRecord
 
 
-class Held(NamedTuple):
+class OrphanedMessage(NamedTuple):
     """A message whose maker's record was left out."""
 
     stream: str
@@ -37,7 +37,7 @@ class Held(NamedTuple):
         return self.incarnation, self.seq
 
 
-class Taken(NamedTuple):
+class ResumePoint(NamedTuple):
     """Place where an operator is to be taken up: its changed parameters, its state (None: not known), and the code of
     its last `setup()` if that is left out."""
 
@@ -49,7 +49,7 @@ class Taken(NamedTuple):
 
 
 def cut_record(
-    before: FiringRecord, *, left_out: int, taken: Taken | None, held: Iterable[Held], stamp: int
+    before: FiringRecord, *, left_out: int, taken: ResumePoint | None, held: Iterable[OrphanedMessage], stamp: int
 ) -> FiringRecord:
     """The record that takes the place of `before` and of those in front of it."""
     detail: dict[str, Any] = {"held": [list(message) for message in held]}
@@ -62,20 +62,20 @@ def cut_record(
     return FiringRecord(before.operator, before.incarnation, before.index, "cut", stamp, detail=detail)
 
 
-def held_by(record: FiringRecord) -> Iterator[Held]:
+def held_by(record: FiringRecord) -> Iterator[OrphanedMessage]:
     """The messages that a `cut` record accounts for."""
     if record.kind == "cut":
         for message in record.detail.get("held", ()):
-            yield Held(*message)
+            yield OrphanedMessage(*message)
 
 
-def taken_by(record: FiringRecord) -> Taken | None:
+def taken_by(record: FiringRecord) -> ResumePoint | None:
     """Returns where a `cut` record takes an operator up; None where no calls were left out."""
     detail = record.detail
     if record.kind != "cut" or "left_out" not in detail:  # that of a snapshot is the size of one too large to be kept
         return None
     at_setup, since = detail["params"]
-    return Taken(bool(detail["again"]), at_setup, since, detail.get("state"), code_in(record))
+    return ResumePoint(bool(detail["again"]), at_setup, since, detail.get("state"), code_in(record))
 
 
 def code_in(record: FiringRecord) -> Mapping[str, str] | None:
@@ -109,7 +109,7 @@ def is_known(record: FiringRecord) -> bool:
     return record.kind in ("snapshot", "cut") and "state" in record.detail
 
 
-class Knowledge:
+class StateKnowledge:
     """Follows the records of an operator with a state: whether it is known, from a cut without a state on."""
 
     def __init__(self) -> None:

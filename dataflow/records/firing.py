@@ -237,7 +237,7 @@ class Rows(NamedTuple):
 
 
 def unpack_batch(data: bytes) -> Rows:
-    """The rows of a batch, for those who need little of each. Raises `FiringRecordError` for what is no batch; what a
+    """The rows of a batch, for uses that need little of each. Raises `FiringRecordError` for what is no batch; what a
     row holds is not looked at."""
     try:
         batch = msgpack.unpackb(data, raw=False)

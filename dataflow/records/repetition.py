@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from dataflow.records.cuts import Knowledge, code_in, is_known
+from dataflow.records.cuts import StateKnowledge, code_in, is_known
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Repeatable, note_taken
 from dataflow.sync import Uses
@@ -46,7 +46,7 @@ class Repetition:
         return None if at is None or self._code[at] == self._code[max(self._code)] else self._code[at]
 
     def __iter__(self) -> Iterator[FiringRecord]:
-        knowledge = Knowledge()
+        knowledge = StateKnowledge()
         for number, record in self._numbered():
             if number is not None and number >= self._skipped:
                 kept = record if self._stateless else knowledge.of(record)
@@ -74,7 +74,7 @@ class Repetition:
                 yield 0, stamp
             if self._stateless or self._skipped:
                 self.began = "stateless" if self._stateless else "snapshot"
-        knowledge = Knowledge()
+        knowledge = StateKnowledge()
         for number, record in self._numbered():
             if (code := code_in(record)) is not None:
                 self._code[record.incarnation] = code

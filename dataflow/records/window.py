@@ -12,7 +12,7 @@ from itertools import islice
 from dataflow.recording import Recording
 from dataflow.recording.layout import PARAMETERS, RECOVERED, TOLD
 from dataflow.recording.streams.cutting import cut_of
-from dataflow.records.cuts import Taken, cut_record, is_known
+from dataflow.records.cuts import ResumePoint, cut_record, is_known
 from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, decode_batch, encode_batch
 from dataflow.records.reading import FiringLog, Maker, note_taken
 
@@ -38,7 +38,7 @@ def records_from(
     """Reads the records that repeating all operators from `stamp` (ns) on needs, up to about `end` (ns), or all of them
     where that is not known.
 
-    It is known of recordings whose events tell of what happens to operators besides firings, if nothing did before. Of
+    It is known of recordings whose events cover what happens to operators besides firings, if nothing did before. Of
     an operator with a state it takes one recorded at or before `stamp`. `makers`: the nodes of the graph, of which the
     `stateless` and the `stateful` ones may be repeated. `reach`: the span (ns) before `stamp` in which they are looked
     for at first, by default `FIRST_REACH`. Raises `RecordingError`.
@@ -103,7 +103,7 @@ def _window(
         if first.index > last.index + 1:
             place = FiringRecord(operator, 0, first.index - 1, "fire", first.stamp)
             left_out = first.index - 1 - last.index
-            taken = Taken(again=False, at_setup={}, since={}, state=None)
+            taken = ResumePoint(again=False, at_setup={}, since={}, state=None)
             cut = cut_record(place, left_out=left_out, taken=taken, held=(), stamp=first.stamp)
             kept[operator] = [head, encode_batch([cut])]
             begins[operator] = first.index

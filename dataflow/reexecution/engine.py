@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from dataflow.execution.driver import Driver, HandOver
+from dataflow.execution.driver import Driver, LocalEmitter
 from dataflow.execution.feeds.log import LogFeed
 from dataflow.execution.memory import MemoryGuard
 from dataflow.execution.recorded import RecordedRunner, Watcher
@@ -36,7 +36,7 @@ End = Callable[[str, int | None, str], None]
 _NOTHING: Mapping[str, tuple[int | None, int | None]] = {}
 
 
-class Stuck(RuntimeError):
+class ReexecutionStalled(RuntimeError):
     """No recorded firing can be made, and nothing is left to read: a fault of the records or of the engine."""
 
 
@@ -112,7 +112,7 @@ class Recomputation:
         make_effects: bool = False,
         in_turn: Collection[str] = (),
     ) -> None:
-        self._driver = Driver(in_order=True)  # who writes into a message comes before those whose digests show it
+        self._driver = Driver(in_order=True)  # writers into a message come before readers whose digests show it
         nodes = [graph.nodes[name] for name in feeding.operators]
         records = {n.name: partial(_until, partial(log.ordered, n), slices.get(n.name, (None, end))[1]) for n in nodes}
         outlet = _HandOver(self._driver, frozenset(feeding.streams), made, ended)
@@ -157,7 +157,7 @@ class Recomputation:
 
     def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
         """Makes the recorded firings, to the end or until `until()`, asked now and then; then closes. Raises
-        `OperatorFailure`, `RecordingError`, `Stuck`."""
+        `OperatorFailure`, `RecordingError`, `ReexecutionStalled`."""
         try:
             self.begin()
             began = time.monotonic()
@@ -171,7 +171,9 @@ class Recomputation:
             if close:
                 self.close()
         if waiting := [r.node.name for r in self.runners.values() if not r.ended]:
-            raise Stuck(f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}")
+            raise ReexecutionStalled(
+                f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}"
+            )
         return self.results()
 
     def begin(self) -> None:
@@ -248,7 +250,7 @@ def _until(records: Callable[[], Iterable[FiringRecord]], end: int | None) -> It
         yield record
 
 
-class _HandOver(HandOver):
+class _HandOver(LocalEmitter):
     """Gives messages to `take`, too, and to no operator where those that take the stream are fed from `elsewhere`."""
 
     def __init__(self, driver: Driver, elsewhere: frozenset[str], take: Take | None, ended: End | None) -> None:

@@ -20,7 +20,7 @@ def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from dataflow.interop.conversions import CONVERSIONS
-    from dataflow.interop.ros.outward import OUTWARD
+    from dataflow.interop.ros.to_ros2 import OUTWARD
     from dataflow.ros.source import source_of
 
     known = {kind.__name__: kind for kind in (*OUTWARD, *(to for _, to in CONVERSIONS))}

@@ -15,8 +15,8 @@ from rosbags.typesys.store import Typestore
 
 from dataflow.interop.bag import Topic
 from dataflow.interop.ros import CONVERSIONS
-from dataflow.interop.ros.made import typestore
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.construction import typestore
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.interop.topics import TopicReader, reader_of
 from dataflow.messages import Message
 from dataflow.recording.errors import RecordingError

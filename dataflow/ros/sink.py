@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal, Union
 
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.messages import CameraInfo, Message, Transforms
 from dataflow.operator import In, Operator, Param, Sampled, SourceError
 from dataflow.ros.definitions import store_of, type_hash, written

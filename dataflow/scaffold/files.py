@@ -22,18 +22,18 @@ _OPERATORS = {
 }
 
 
-class NameFault(ValueError):
+class InvalidName(ValueError):
     """A module, a class or a graph cannot have this name; the message has the reason."""
 
 
 def snake(name: str) -> str:
-    """`NearestObstacle`, `nearest-obstacle` → `nearest_obstacle`. Raises `NameFault`."""
+    """`NearestObstacle`, `nearest-obstacle` → `nearest_obstacle`. Raises `InvalidName`."""
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
     found = re.sub(r"[-\s.]+", "_", parts).lower()
     if not found.isidentifier() or not found.isascii():
-        raise NameFault(f"{name!r} cannot be a name in Python: write letters, digits and '_', a letter first")
+        raise InvalidName(f"{name!r} cannot be a name in Python: write letters, digits and '_', a letter first")
     if keyword.iskeyword(found) or found in sys.stdlib_module_names or found in ("dataflow", "operators", "tests"):
-        raise NameFault(f"{name!r} is taken: Python has {found!r} already; choose another name")
+        raise InvalidName(f"{name!r} is taken: Python has {found!r} already; choose another name")
     return found
 
 
@@ -102,7 +102,7 @@ def service_files(
 ) -> Mapping[Path, str]:
     """A unit of systemd that runs `command` in `folder` as `user`, and what deletes files in `out` after `days`.
 
-    Raises `NameFault` for a name that systemd does not take.
+    Raises `InvalidName` for a name that systemd does not take.
     """
     words = {**_unit_words(name, command, folder, user), "out": _systemd_word(str(out)), "days": str(days)}
     install = f"sudo cp {name}.service /etc/systemd/system/ && sudo cp {name}.conf /etc/tmpfiles.d/"
@@ -113,7 +113,7 @@ def service_files(
 
 
 def agent_files(name: str, command: Sequence[str], *, folder: Path, user: str) -> Mapping[Path, str]:
-    """A unit of systemd that lets the machine `name` join runs by `command`. Raises `NameFault` as `service_files`."""
+    """A unit of systemd by which machine `name` joins runs with `command`. Raises `InvalidName` as `service_files`."""
     unit = f"dataflow-{name}"
     words = _unit_words(unit, command, folder, user)
     install = f"sudo cp {unit}.service /etc/systemd/system/"
@@ -122,7 +122,7 @@ def agent_files(name: str, command: Sequence[str], *, folder: Path, user: str) -
 
 def _unit_words(name: str, command: Sequence[str], folder: Path, user: str) -> dict[str, str]:
     if not re.fullmatch(r"[A-Za-z0-9_.-]+", name):
-        raise NameFault(f"{name!r} cannot be the name of a service: write letters, digits, '_', '-' and '.'")
+        raise InvalidName(f"{name!r} cannot be the name of a service: write letters, digits, '_', '-' and '.'")
     return {
         "name": name,
         "user": user,

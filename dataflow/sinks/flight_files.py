@@ -17,7 +17,7 @@ from dataflow.editing.spans import folded
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import FLIGHT
-from dataflow.records.cuts import Held
+from dataflow.records.cuts import OrphanedMessage
 from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import FiringLog
 
@@ -33,7 +33,7 @@ class Segment:
 
     path: Path
     begin: int | None
-    held: Mapping[str, list[Held]]
+    held: Mapping[str, list[OrphanedMessage]]
 
 
 class FlightFiles:
@@ -54,7 +54,7 @@ class FlightFiles:
         self._asked.put(partial(self._forget, segment))
 
     def join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
-        """Cuts a span out of some files into a recording; `one` is told how large it is, or what went wrong."""
+        """Cuts a span out of some files into a recording; `one` is given its size, or what went wrong."""
         self._asked.put(partial(self._join, segments, part, out, one))
 
     def finish(self) -> None:

@@ -19,13 +19,13 @@ from dataflow.graph.model import Graph
 from dataflow.graph.sections import Flight
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.parts import Storage
-from dataflow.records.cuts import Held
+from dataflow.records.cuts import OrphanedMessage
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.sinks.flight_files import FlightFiles, Segment
-from dataflow.sinks.outage import Lost, Outage
+from dataflow.sinks.outage import Outage, RecordingLosses
 from dataflow.sinks.recorder import GOES_ON, RecorderSink
 from dataflow.sinks.sink import StreamSink
 from dataflow.sinks.triggers import Triggers
@@ -42,7 +42,7 @@ SHORTEST = 1_000_000_000
 
 
 @dataclass(slots=True)
-class Wanted:
+class PendingSpan:
     """A span that is to be kept: from `start` until the clock is at `due`."""
 
     start: int
@@ -73,20 +73,20 @@ class FlightSink(StreamSink):
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
         self._recorded: dict[str, int] = {}
-        """The last stamp of which each operator's firing records tell."""
+        """The last stamp in each operator's firing records."""
         self._forgotten = False
         self._work = FlightFiles(graph, self._storage.mode)
         self._segments: deque[Segment] = deque()
         self._made = 0
         self._begun = 0
         self._triggers = Triggers(flight.when)
-        self._wanted: Wanted | None = None
+        self._wanted: PendingSpan | None = None
         self._kept: list[dict[str, Any]] = []
         self._refused = 0
         self._said_full = False
         self.messages = 0
         self._outage = Outage(folder)
-        self.lost = Lost()
+        self.lost = RecordingLosses()
         self._given: Counter[str] = Counter()
         self._sink: RecorderSink | None = self._open()
 
@@ -173,12 +173,12 @@ class FlightSink(StreamSink):
         """Begins the next file, with the newest message of every stream in front."""
         path = self._ring / f"{self._made:06}.mcap"
         self._made += 1
-        sink, held = None, dict[str, list[Held]]()
+        sink, held = None, dict[str, list[OrphanedMessage]]()
         try:
             sink = RecorderSink(path, self.graph, self._streams, self._options)
             for stream, (message, seq, incarnation) in sorted(self._newest.items()):
                 sink.message(stream, message, seq, incarnation)
-                one = Held(stream, incarnation, seq, message.stamp, message.digest())
+                one = OrphanedMessage(stream, incarnation, seq, message.stamp, message.digest())
                 held.setdefault(self.graph.streams[stream].node, []).append(one)
         except RecordingError:
             if sink is not None:
@@ -273,7 +273,7 @@ class FlightSink(StreamSink):
 
     # Keeping
 
-    def _is_over(self, wanted: Wanted) -> bool:
+    def _is_over(self, wanted: PendingSpan) -> bool:
         """Returns whether a span is over, and the firing records of it, some of every operator, have had the time to
         come."""
         if self._clock <= wanted.due:
@@ -297,13 +297,13 @@ class FlightSink(StreamSink):
             self._refused += 1
             return
         if self._wanted is None:
-            self._wanted = Wanted(self._clock - self.flight.keep, self._clock + self.flight.after)
+            self._wanted = PendingSpan(self._clock - self.flight.keep, self._clock + self.flight.after)
         elif self._clock + self.flight.after - self._wanted.start <= 2 * (self.flight.keep + self.flight.after):
             self._wanted.due = max(self._wanted.due, self._clock + self.flight.after)
         if len(self._wanted.reasons) < MOST_REASONS:
             self._wanted.reasons.append(reason)
 
-    def _keep(self, wanted: Wanted, outcome: str = "") -> None:
+    def _keep(self, wanted: PendingSpan, outcome: str = "") -> None:
         """Closes the current file and joins what is wanted of all of them."""
         self._wanted = None
         if self._sink is not None:

@@ -19,7 +19,7 @@ MOST_REASONS = 20
 
 
 @dataclass(slots=True)
-class Lost:
+class RecordingLosses:
     """Counts what a recording lacks."""
 
     messages: Counter[str] = field(default_factory=Counter)

@@ -26,9 +26,9 @@ from dataflow.recording import LogLine, RecordingError
 from dataflow.recording.layout import CUT
 from dataflow.recording.parts import Storage, part_path, parts_of
 from dataflow.recording.streams.cutting import Cut
-from dataflow.records.cuts import Held
+from dataflow.records.cuts import OrphanedMessage
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
-from dataflow.sinks.outage import Lost, Outage
+from dataflow.sinks.outage import Outage, RecordingLosses
 from dataflow.sinks.recorder import GOES_ON, RecorderSink
 from dataflow.sinks.sink import StreamSink
 from dataflow.video.group import Groups
@@ -75,7 +75,7 @@ class PartsSink(StreamSink):
         self._static = {stream for stream in streams if graph.streams[stream].static}
         self._statics: dict[str, tuple[Message, int, int]] = {}
         self._groups = Groups[tuple[Message, int, int]]()
-        self._held: dict[str, list[Held]] = {}
+        self._held: dict[str, list[OrphanedMessage]] = {}
         """By operator, the packets of video in front of the current part."""
         self._folded: dict[str, list[FiringRecord]] = {}
         self._introduced: set[str] = set()
@@ -93,7 +93,7 @@ class PartsSink(StreamSink):
         self._lives: dict[str, int] = {}
         """The newest incarnation of each stream and operator."""
         self._outage = Outage(path.parent)
-        self.lost = Lost()
+        self.lost = RecordingLosses()
         if options["overwrite"] and self._splits and life == 1:
             for old in parts_of(path):
                 old.unlink()
@@ -259,7 +259,7 @@ class PartsSink(StreamSink):
             part.sink.message(stream, packet, seq, incarnation)
             part.repeated[stream] += 1
             held = self._held.setdefault(self._graph.streams[stream].node, [])
-            held.append(Held(stream, incarnation, seq, packet.stamp, packet.digest()))
+            held.append(OrphanedMessage(stream, incarnation, seq, packet.stamp, packet.digest()))
 
     def _free_name(self) -> Path:
         """The name of the next part. None is used twice, not even that of one that was deleted."""

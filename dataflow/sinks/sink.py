@@ -19,7 +19,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.priority import let_others_begin
 from dataflow.process.streams.inbox import Inbox
@@ -263,7 +263,7 @@ class SinkProcess:
     def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
         match kind:
             case "poll":
-                self._report(time.monotonic())  # what is owed comes first: idle is who owes nothing
+                self._report(time.monotonic())  # what is owed comes first: idle means owing nothing
                 self.channel.send(
                     "state",
                     round=fields["round"],

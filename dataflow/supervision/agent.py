@@ -32,7 +32,7 @@ from dataflow.machines.gate import Gate, Routes, Word
 from dataflow.machines.hub import POOL_BYTES, machine_key, router
 from dataflow.machines.keys import settings
 from dataflow.machines.pipe import AWAY_AFTER, Pipe
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.descriptors import take_descriptors
 from dataflow.process.streams.inbox import Inbox
 from dataflow.recording.streams.facts import machine_facts
@@ -64,8 +64,8 @@ class Agent:
     def __init__(
         self, name: str, endpoint: str, keys: Path | None, folder: Path, notice: Callable[[str], None], patience: float
     ) -> None:
-        """`patience`: the seconds for which operators go on without the supervisor being heard. `notice` shows a line
-        to who has started the agent."""
+        """`patience`: the seconds for which operators go on without a sign of life from the supervisor. `notice`
+        shows a line to the user who has started the agent."""
         self.name, self.patience, self.notice, self._endpoint = name, patience, notice, endpoint
         self.folder, self._keys = folder.absolute(), keys and keys.absolute()  # it changes into its folder
         self._id = secrets.token_bytes(8)
@@ -103,7 +103,7 @@ class Agent:
                     continue
                 self._run, self._offered = self._offered, ""
                 gc.collect()  # the links of the stay before, whose pipe refers to it
-                Stay(self, bus, self._run, reserved.endpoints[0]).last()
+                RunParticipation(self, bus, self._run, reserved.endpoints[0]).last()
                 self._over.add(self._run)
                 self._run = ""
                 if once:
@@ -146,7 +146,7 @@ class Agent:
         return self.stopped or bool(self._offered)
 
 
-class Stay:
+class RunParticipation:
     """One run's stay on this machine."""
 
     def __init__(self, agent: Agent, bus: Bus, run: str, router_endpoint: str) -> None:
@@ -358,21 +358,21 @@ class Stay:
 
     def _feed(self, event: events.Event) -> None:
         match event:
-            case events.Said(label, "beat", fields):  # behind a slow link's messages it would come too late
+            case events.Received(label, "beat", fields):  # behind a slow link's messages it would come too late
                 self._gate.say_now(SUPERVISOR, (label, "said", {"kind": "beat", "fields": dict(fields)}))
-            case events.Said(label, kind, fields):
+            case events.Received(label, kind, fields):
                 self._say(label, "said", kind=kind, fields=dict(fields))
-            case events.HungUp(label):
+            case events.Disconnected(label):
                 self._say(label, "hung up")
             case events.NotReading(label, seconds, waiting, overflowed):
                 self._say(label, "not reading", seconds=seconds, waiting=waiting, overflowed=overflowed)
-            case events.Remained(label, remains):
+            case events.RecordsRecovered(label, remains):
                 reached = {name: list(astuple(each)) for name, each in remains.reached.items()}
                 batches = {name: list(each) for name, each in remains.batches.items()}
                 self._say(label, "remained", batches=batches, reached=reached)
-            case events.Died(label, code):
+            case events.Exited(label, code):
                 self._say(label, "died", code=code)
-            case events.LeftBehind(labels, processes):
+            case events.OrphansKilled(labels, processes):
                 self._say("", "left", labels=list(labels), processes=list(processes))
             case events.Aborted(why):
                 self._say("", "failed", why=why)

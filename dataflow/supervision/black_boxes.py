@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 
 from dataflow.graph.model import Graph
-from dataflow.records.black_box import Remains, make_black_box, read_black_box
+from dataflow.records.black_box import RecoveredRecords, make_black_box, read_black_box
 from dataflow.supervision.plan import ProcessPlan
 
 
@@ -25,7 +25,7 @@ class Boxes:
         self._boxes[label] = make_black_box()
         return (self._boxes[label],)
 
-    def read(self, label: str) -> Remains | None:
+    def read(self, label: str) -> RecoveredRecords | None:
         """Reads the firing records that a process which ended has left, once; None where it had no box."""
         box = self._boxes.pop(label, None)
         if box is None:

@@ -15,7 +15,7 @@ from dataflow.process.channel import ChannelClosed
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.core import events
 from dataflow.supervision.links import Links
-from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
+from dataflow.supervision.nursery import Child, ChildExited, Nursery, NurseryFailed
 
 NOT_READING_AFTER = 1.0
 """Seconds for which a process may leave what was sent to it, before the core is notified."""
@@ -76,10 +76,10 @@ class Children:
                     self._ended(label, None)
             return
         for each in news:
-            if isinstance(each, End):
+            if isinstance(each, ChildExited):
                 self._ended(self._label(each.child), each.code)
             else:
-                self._feed(events.LeftBehind(tuple(map(self._label, each.children)), each.processes))
+                self._feed(events.OrphansKilled(tuple(map(self._label, each.children)), each.processes))
 
     def _label(self, process: Child) -> str:
         return next(label for label, child in self._children.items() if child is process)
@@ -97,8 +97,8 @@ class Children:
         del self._children[label]
         self._taken_at.pop(label, None)
         if (remains := self._boxes.read(label)) is not None:
-            self._feed(events.Remained(label, remains))
-        self._feed(events.Died(label, code))
+            self._feed(events.RecordsRecovered(label, remains))
+        self._feed(events.Exited(label, code))
 
     def _read_channel(self, label: str) -> None:
         child = self._children.get(label)
@@ -109,14 +109,14 @@ class Children:
         except ChannelClosed:
             with contextlib.suppress(KeyError):
                 self._selector.unregister(child.channel)
-            self._feed(events.HungUp(label))
+            self._feed(events.Disconnected(label))
 
     def _read_messages(self, label: str, child: Child) -> bool:
         """Feeds what a process has said; False when there was nothing."""
         any_read = False
         for kind, fields in child.channel.receive():
             any_read = True
-            self._feed(events.Said(label, kind, fields))
+            self._feed(events.Received(label, kind, fields))
         return any_read
 
     def _read_words(self, label: str) -> None:
@@ -170,7 +170,7 @@ class Children:
             child.signal(number)
 
     def flush(self) -> None:
-        """Sends what processes take; who takes nothing is looked at again when it does."""
+        """Sends what processes take; one that takes nothing is looked at again when it does."""
         now = self._clock()
         for label, child in self._children.items():
             channel = child.channel

@@ -1,4 +1,4 @@
-"""The supervisor's end of the nursery: asks for processes and is told how they end. Nothing here waits, but `close`."""
+"""The supervisor's end of the nursery: requests processes and gets their exit codes. Nothing here waits but `close`."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class Child:
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class ChildExited:
     """A child has ended with this exit code, negative for a signal."""
 
     child: Child
@@ -157,7 +157,7 @@ class End:
 
 
 @dataclass(frozen=True, slots=True)
-class Leftovers:
+class Orphans:
     """A child has left these processes behind, or one of several that ended at once; they were killed."""
 
     children: tuple[Child, ...]
@@ -237,7 +237,7 @@ class Nursery:
         self._unborn.append(child)
         return child
 
-    def receive(self) -> list[End | Leftovers]:
+    def receive(self) -> list[ChildExited | Orphans]:
         """Takes in the nursery's messages. Raises `NurseryFailed` when it is gone."""
         try:
             data, pidfds, _, _ = socket.recv_fds(self._socket, 65536, 16)
@@ -254,7 +254,7 @@ class Nursery:
         news = (self._taken(*message) for message in self._unpacker)
         return [each for each in news if each is not None]
 
-    def _taken(self, what: str, pid: int, fact: Any) -> End | Leftovers | None:
+    def _taken(self, what: str, pid: int, fact: Any) -> ChildExited | Orphans | None:
         match what:
             case "spawned":
                 child = self._unborn.popleft()
@@ -263,9 +263,9 @@ class Nursery:
                 return None
             case "left":
                 processes, others = fact
-                return Leftovers(tuple(self._children[each] for each in (pid, *others)), tuple(processes))
+                return Orphans(tuple(self._children[each] for each in (pid, *others)), tuple(processes))
             case _:
-                return End(self._children.pop(pid), int(fact))
+                return ChildExited(self._children.pop(pid), int(fact))
 
     def close(self) -> None:
         """Ends the nursery, and with it any process that is left."""

@@ -45,7 +45,7 @@ class LogPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
+class Rendezvous:
     """The endpoint at which other machines join a run, and the folder of this machine's keys; see `machines.keys`."""
 
     endpoint: str
@@ -81,7 +81,7 @@ class RunPlan:
     view_file: Path | None = None
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     live: bool = False
-    machines: Meeting | None = None
+    machines: Rendezvous | None = None
     faults: Iterator[Fault] | None = None
     rate: float | None = None
     paused: bool = False

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from dataflow.execution.failure import MOST_OF_A_TRACEBACK, cut
 from dataflow.messages.fields.memory import make_large_arrays_in
-from dataflow.process.awake import LOOK_EVERY, AwakeClock
+from dataflow.process.awake_clock import LOOK_EVERY, AwakeClock
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.descriptors import Descriptors, take_descriptors
 from dataflow.process.log_pipe import log_failure

@@ -19,12 +19,12 @@ from dataflow.machines import files
 from dataflow.machines.gate import Routes
 from dataflow.names import firings_key
 from dataflow.recording.streams.facts import FACTS, record_elsewhere
-from dataflow.records.black_box import Reached, Remains
+from dataflow.records.black_box import OperatorProgress, RecoveredRecords
 from dataflow.supervision.children import Children
 from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.links import Pairs, gate_of
-from dataflow.supervision.plan import LINK, Meeting, ProcessPlan, RunPlan
+from dataflow.supervision.plan import LINK, ProcessPlan, Rendezvous, RunPlan
 
 PIECES_ON_THE_WAY = 4
 """Pieces of files that were sent to a machine before it took the first of them."""
@@ -40,7 +40,7 @@ class Remote:
     def __init__(
         self,
         plan: RunPlan,
-        meeting: Meeting,
+        rendezvous: Rendezvous,
         processes: Mapping[str, ProcessPlan],
         pairs: Pairs,
         endpoints: Mapping[str, str],
@@ -51,7 +51,7 @@ class Remote:
     ) -> None:
         """`endpoints`: by label, where the processes here and the link listen."""
         self._live = plan.live
-        self._plan, self._meeting, self._processes, self._pairs = plan, meeting, processes, pairs
+        self._plan, self._rendezvous, self._processes, self._pairs = plan, rendezvous, processes, pairs
         self._here, self._feed, self._printed, self._note = here, feed, printed, note
         self.machine_of = {
             label: process.machine for label, process in processes.items() if process.machine is not None
@@ -77,8 +77,8 @@ class Remote:
         graph = self._plan.graph
         return {
             **link_of(self._live, self._processes, self._pairs, gate_of(None)),
-            "endpoint": self._meeting.endpoint,
-            "keys": None if self._meeting.keys is None else str(self._meeting.keys.absolute()),
+            "endpoint": self._rendezvous.endpoint,
+            "keys": None if self._rendezvous.keys is None else str(self._rendezvous.keys.absolute()),
             "listen": endpoints[LINK],
             "connect": [at for label, at in endpoints.items() if label != LINK and label not in self.machine_of],
             "run": secrets.token_hex(8),
@@ -122,8 +122,8 @@ class Remote:
 
     def advice(self) -> str:
         """Returns the command that joins a machine."""
-        keys = "" if self._meeting.keys is None else " --keys FOLDER"
-        return f"dataflow join NAME --connect {self._meeting.endpoint}{keys}"
+        keys = "" if self._rendezvous.keys is None else " --keys FOLDER"
+        return f"dataflow join NAME --connect {self._rendezvous.endpoint}{keys}"
 
     def _prepare(self, machine: str) -> None:
         """Shows a machine, once, what it needs."""
@@ -211,15 +211,15 @@ class Remote:
     def take(self, event: events.Event) -> None:
         """Takes an event of the link's process. Raises `RunFailed` when the run cannot do without it any more."""
         match event:
-            case events.Said(_, "failed", fields):
+            case events.Received(_, "failed", fields):
                 raise RunFailed(f"the link to other machines failed: {fields['summary']}", fields["traceback"])
-            case events.Said(_, kind, fields):
+            case events.Received(_, kind, fields):
                 self._heard(kind, fields)
             case events.NotReading(_, seconds, waiting, True) if not self.ending:
                 raise RunFailed(
                     f"the link to other machines has read nothing for {seconds:.1f} s; {waiting} words wait"
                 )
-            case events.Died():
+            case events.Exited():
                 self.ended = True
                 if not self.ending:
                     raise RunFailed("the link to other machines died")
@@ -263,20 +263,20 @@ class Remote:
             return
         match kind:
             case "said":
-                self._feed(events.Said(label, fields["kind"], fields["fields"]))
+                self._feed(events.Received(label, fields["kind"], fields["fields"]))
             case "printed":
                 self._printed(label, fields["line"])
             case "hung up":
-                self._feed(events.HungUp(label))
+                self._feed(events.Disconnected(label))
             case "not reading":
                 self._feed(events.NotReading(label, **fields))
             case "remained":
-                reached = {name: Reached(*values) for name, values in fields["reached"].items()}
-                self._feed(events.Remained(label, Remains(fields["batches"], reached)))
+                reached = {name: OperatorProgress(*values) for name, values in fields["reached"].items()}
+                self._feed(events.RecordsRecovered(label, RecoveredRecords(fields["batches"], reached)))
             case "died":
-                self._feed(events.Died(label, fields["code"]))
+                self._feed(events.Exited(label, fields["code"]))
             case "left":
-                self._feed(events.LeftBehind(tuple(fields["labels"]), tuple(fields["processes"])))
+                self._feed(events.OrphansKilled(tuple(fields["labels"]), tuple(fields["processes"])))
             case "differs":
                 what = "; ".join(fields["what"][:20]) + ("; ..." if len(fields["what"]) > 20 else "")
                 raise RunFailed(f"machine {machine!r} cannot take part: {what}")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from dataflow.environments import EnvError
 from dataflow.execution.feeds.playback import Action
 from dataflow.execution.threads import environment
-from dataflow.process.awake import LONGEST_STEP, AwakeClock
+from dataflow.process.awake_clock import LONGEST_STEP, AwakeClock
 from dataflow.process.log_pipe import heard, shown
 from dataflow.supervision.black_boxes import Boxes
 from dataflow.supervision.children import Children
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 TICK = 0.05
 PART_WITHIN = 4.0
-"""Seconds for which other machines are told that the run is over."""
+"""Seconds for which other machines are notified that the run is over."""
 PAUSE = 1.0
 """Seconds for which the supervisor did not run, at once, that are worth saying."""
 
@@ -59,12 +59,12 @@ class Supervisor:
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
         self._announced = contextlib.ExitStack()
-        self._over: commands.Over | None = None
+        self._over: commands.RunEnded | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
         self._remote: Remote | None = None
         self._stops = 0
-        self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
+        self._asked: deque[events.PlaybackRequested | events.TriggerRequested] = deque()
 
     @property
     def status(self) -> Status:
@@ -77,12 +77,12 @@ class Supervisor:
 
     def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
         """Pauses, resumes, steps what is not live, or changes its speed; on any thread."""
-        self._asked.append(events.PlaybackAsked(action, steps, speed))
+        self._asked.append(events.PlaybackRequested(action, steps, speed))
         self._wake_up()
 
     def trigger(self, text: str) -> None:
         """Has the flight recorder save its history; on any thread."""
-        self._asked.append(events.TriggerAsked(text))
+        self._asked.append(events.TriggerRequested(text))
         self._wake_up()
 
     def _wake_up(self) -> None:
@@ -122,7 +122,7 @@ class Supervisor:
             stack.callback(self._here.bury)
             self._selector.register(self._woken, selectors.EVENT_READ, None)
             if LINK in self._endpoints:
-                stack.callback(self._part)  # machines that were shown what they need are told of any end
+                stack.callback(self._part)  # machines that were shown what they need are notified of any end
                 self._meet(pairs)
             over = self._loop()
         if over.failure is not None:
@@ -156,11 +156,11 @@ class Supervisor:
         """Waits (bounded) until the other machines of the graph are there and have what they need."""
         from dataflow.supervision.remote import Remote  # most runs need no network
 
-        meeting = self.plan.machines
-        assert meeting is not None
+        rendezvous = self.plan.machines
+        assert rendezvous is not None
         self._remote = Remote(
             self.plan,
-            meeting,
+            rendezvous,
             self._processes,
             pairs,
             self._endpoints,
@@ -199,17 +199,17 @@ class Supervisor:
         """Returns what starts, reaches and ends a process."""
         return self._remote if self._remote is not None and label in self._remote.machine_of else self._here
 
-    def _loop(self) -> commands.Over:
+    def _loop(self) -> commands.RunEnded:
         interrupted: BaseException | None = None
         seen_stops = 0
-        self._feed(events.Begin())
+        self._feed(events.RunStarted())
         due = 0.0
         while self._over is None:
             try:
                 self._wait(max(0.0, due - self._clock()))
                 while seen_stops < self._stops:
                     seen_stops += 1
-                    self._feed(events.StopAsked())
+                    self._feed(events.StopRequested())
                 while self._asked:
                     self._feed(self._asked.popleft())
                 if self._clock() >= due:
@@ -292,7 +292,7 @@ class Supervisor:
                 )
             case commands.Withdraw():
                 self._announced.close()
-            case commands.Over():
+            case commands.RunEnded():
                 self._over = command
 
     # End

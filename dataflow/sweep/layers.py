@@ -11,7 +11,7 @@ from dataflow.graph import Graph
 from dataflow.graph.model import Node, Stream
 from dataflow.messages import Message
 from dataflow.recording import Recording
-from dataflow.sweep.swap import Both
+from dataflow.sweep.swap import ReplayedPair
 from dataflow.view import Save, ViewerError, ViewerSink
 
 PATIENCE = 30.0
@@ -48,7 +48,7 @@ def _below(side: str, stream: str) -> str:
     return f"{side}/{operator} {side}/{port}"
 
 
-def draw(both: Both, file: Path) -> ViewerSink:
+def draw(both: ReplayedPair, file: Path) -> ViewerSink:
     """Draws it; returns the viewer, closed. Raises `ViewerError`, `RecordingError`."""
     with Recording(both.files[0]) as a, Recording(both.files[1]) as b:
         graph, first, second = layered(both.graphs, both.different)

@@ -195,7 +195,7 @@ def _stored(store: Any, path: str) -> Iterator[Source]:
         name = file.removeprefix(path).lstrip("/") or file_name(file)
         mark = {key: str(value) for key, value in store.info(file).items()}  # sizes, times, entity tags
         if not any(re.search("tag|time|modified|created|version|md5|digest", key, re.I) for key in mark):
-            mark["read"] = secrets.token_hex(16)  # other bytes of the same size would not be told apart
+            mark["read"] = secrets.token_hex(16)  # other bytes of the same size would not be distinguished
         yield Source(visible(name), store.unstrip_protocol(file), _digest((store.ukey(file), mark)))
 
 

@@ -18,7 +18,7 @@ from dataflow.sweep.work import numbers
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class OperatorShare:
     """An operator's part in the change of a figure, over the recordings that were replayed.
 
     `change`: mean of the figure less A's, with this operator's outputs as B made them and all others A's. `share`: that
@@ -31,7 +31,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Both:
+class ReplayedPair:
     """One recording replayed by A's graph and by B's, with every stream recorded: `files`.
 
     `different`: streams whose digests differ, or that only one of them has.
@@ -52,7 +52,7 @@ class Both:
         return _named(LocalRun(graph, log=log).execute().summaries)
 
 
-def both(recording: Path, graphs: tuple[Graph, Graph], maps: Sequence[str], folder: Path) -> Both:
+def both(recording: Path, graphs: tuple[Graph, Graph], maps: Sequence[str], folder: Path) -> ReplayedPair:
     """Replays a recording, or a bag, by two graphs in this process; records all streams in `folder`.
 
     Raises `ReplayError`, `RunFailed`, `MappingError`.
@@ -67,7 +67,7 @@ def both(recording: Path, graphs: tuple[Graph, Graph], maps: Sequence[str], fold
         digests.append(made.digests())
     a, b = digests
     different = frozenset(stream for stream in a.keys() | b.keys() if a.get(stream) != b.get(stream))
-    return Both(graphs, (files[0], files[1]), (found[0], found[1]), different)
+    return ReplayedPair(graphs, (files[0], files[1]), (found[0], found[1]), different)
 
 
 def between(graphs: tuple[Graph, Graph], different: Iterable[str], figure: str) -> list[str]:
@@ -90,18 +90,18 @@ def between(graphs: tuple[Graph, Graph], different: Iterable[str], figure: str) 
     return found
 
 
-def parts(one: Both, operators: Sequence[str], figure: str) -> Mapping[str, float]:
+def parts(one: ReplayedPair, operators: Sequence[str], figure: str) -> Mapping[str, float]:
     """Returns the figure less A's: by operator, with its outputs as B made them, and "" for B itself. Raises as
-    `Both.swapped` does."""
+    `ReplayedPair.swapped` does."""
     a, b = (found.get(figure, math.nan) for found in one.figures)
     return {"": b - a} | {name: one.swapped(name).get(figure, math.nan) - a for name in operators}
 
 
-def shares(found: Sequence[Mapping[str, float]]) -> list[Share]:
+def shares(found: Sequence[Mapping[str, float]]) -> list[OperatorShare]:
     """Returns the mean part of each operator in what `parts` found in recordings."""
     means = {name: sum(one[name] for one in found) / len(found) for name in found[0]}
     whole = means.pop("")
-    return [Share(name, change, change / whole if whole else math.nan) for name, change in means.items()]
+    return [OperatorShare(name, change, change / whole if whole else math.nan) for name, change in means.items()]
 
 
 def _named(summaries: Mapping[str, Mapping[str, object]]) -> dict[str, float]:

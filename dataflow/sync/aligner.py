@@ -29,7 +29,7 @@ from collections.abc import Collection, Mapping
 from itertools import count
 from typing import NamedTuple
 
-from dataflow.sync.context import Absent, Context
+from dataflow.sync.context import Context, InputAbsent
 from dataflow.sync.drops import DropLog
 from dataflow.sync.entries import Drop, Entry, Firing, FiringKind, Waiting
 from dataflow.sync.inputs import Inputs
@@ -52,7 +52,7 @@ class StreamEnd(NamedTuple):
 
 
 class Aligner:
-    """Decides one operator's firings. `push`, `advance` and `end` tell it what streams said; `poll` asks. One thread at
+    """Decides one operator's firings. `push`, `advance` and `end` take what streams carry; `poll` asks. One thread at
     a time. Frontiers and stamps are integer nanoseconds."""
 
     def __init__(self, spec: AlignSpec) -> None:
@@ -284,7 +284,7 @@ class Aligner:
             inputs = self._triggers.take() if undecided.triggered else self._triggers.absent()
             return Firing(stamp, kind, undecided.ticked, inputs, _NO_NAMES, _NO_NAMES)
         values = context.take(stamp, self._last_firing)
-        if isinstance(values, Absent):
+        if isinstance(values, InputAbsent):
             if undecided.triggered:
                 self._triggers.reject(values.reason, values.input)
             if undecided.ticked:

@@ -15,7 +15,7 @@ from dataflow.sync.spec import AlignSpec
 _NO_NAMES: frozenset[str] = frozenset()
 
 
-class Absent(NamedTuple):
+class InputAbsent(NamedTuple):
     """A required Sampled input has no value: there is no firing."""
 
     reason: DropReason
@@ -56,15 +56,15 @@ class Context:
         inputs: tuple[Sampled | Batch, ...] = (*self._sampled.values(), *self._batches.values())
         return {each.name: need for each in inputs if (need := each.needs(stamp)) is not None}
 
-    def take(self, stamp: int, last_firing: int) -> dict[str, InputValue] | Absent:
-        """The values at `stamp`, which are known; `Absent`, and nothing is taken, where there is to be no firing."""
+    def take(self, stamp: int, last_firing: int) -> dict[str, InputValue] | InputAbsent:
+        """The values at `stamp`, which are known; `InputAbsent`, and nothing is taken, where nothing is to fire."""
         values: dict[str, InputValue] = {}
         stale: list[str] = []
         late: list[str] = []
         for name, sampled in self._sampled.items():
             value = sampled.choose(stamp)
             if sampled.required and not value:
-                return Absent(sampled.why_absent(), name)
+                return InputAbsent(sampled.why_absent(), name)
             values[name] = value
             if sampled.stale:
                 stale.append(name)

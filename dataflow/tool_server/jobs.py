@@ -44,7 +44,7 @@ PRINTED = 2000
 """Characters that are shown of what operators printed."""
 
 
-class Refused(ValueError):
+class CallFailed(ValueError):
     """Raised for a call that failed; the message has what would be right."""
 
 
@@ -76,10 +76,10 @@ class Jobs:
         self._closed = False
 
     def call(self, tool: str, arguments: Mapping[str, Any]) -> str:
-        """Calls a tool: its answer, or that of its job if it takes longer. Raises `Refused`."""
+        """Calls a tool: its answer, or that of its job if it takes longer. Raises `CallFailed`."""
         with self._lock:
             if sum(not job.future.done() for job in self._jobs.values()) >= MOST_WAITING:
-                raise Refused(f"{MOST_WAITING} jobs are not done: wait for one, or end one by job(id, cancel=true)")
+                raise CallFailed(f"{MOST_WAITING} jobs are not done: wait for one, or end one by job(id, cancel=true)")
             self._number += 1
             job = Job(str(self._number), tool, time.monotonic())
             self._jobs[job.name] = job
@@ -89,11 +89,11 @@ class Jobs:
         return self._answer(job, 0)
 
     def job(self, name: str, offset: int = 0, *, cancel: bool = False) -> str:
-        """Returns the answer of a job from a byte on, or how far it is. Raises `Refused`."""
+        """Returns the answer of a job from a byte on, or how far it is. Raises `CallFailed`."""
         with self._lock:
             job = self._jobs.get(name)
             if job is None:
-                raise Refused(f"no job {name!r}; there are: {', '.join(self._jobs) or 'none'}")
+                raise CallFailed(f"no job {name!r}; there are: {', '.join(self._jobs) or 'none'}")
             if cancel and not job.future.done():
                 job.cancelled = True
                 _end(job.process)
@@ -116,7 +116,7 @@ class Jobs:
         error = job.future.exception()
         text = cut(job.text if error is None else str(error), offset, job.name)
         if job.failed or error is not None:
-            raise Refused(text)
+            raise CallFailed(text)
         return text
 
     def _work(self, job: Job, arguments: Mapping[str, Any]) -> None:
@@ -124,7 +124,7 @@ class Jobs:
         with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed:
             with self._lock:
                 if job.cancelled or self._closed:
-                    raise Refused(f"job {job.name} was cancelled")
+                    raise CallFailed(f"job {job.name} was cancelled")
                 job.progress = "runs"
                 job.process = process = subprocess.Popen(
                     [python, "-P", "-m", "dataflow.tool_server.work"],
@@ -147,10 +147,10 @@ class Jobs:
             printed.seek(max(0, printed.seek(0, os.SEEK_END) - PRINTED))
             text = printed.read().strip()
         if job.cancelled:
-            raise Refused(f"job {job.name} was cancelled after {job.seconds:.1f} s")
+            raise CallFailed(f"job {job.name} was cancelled after {job.seconds:.1f} s")
         if found is None:
             late = f" after {LONGEST:g} s, the longest that a call may take" if job.seconds >= LONGEST else ""
-            raise Refused(f"the process of {job.tool} ended without an answer{late} ({process.returncode}): {text}")
+            raise CallFailed(f"the process of {job.tool} ended without an answer{late} ({process.returncode}): {text}")
         job.failed = "error" in found
         job.text = found["error"] if job.failed else json_text(found["answer"])
         if text and not job.failed:
@@ -161,7 +161,7 @@ def cut(text: str, offset: int, job: str) -> str:
     """Returns the part of an answer from a byte on that fits, with how to ask for the rest."""
     data = text.encode()
     if not 0 <= offset <= len(data):
-        raise Refused(f"offset={offset}: the answer of job {job} has {len(data)} bytes")
+        raise CallFailed(f"offset={offset}: the answer of job {job} has {len(data)} bytes")
     if len(data) - offset <= MOST_BYTES:
         return data[offset:].decode(errors="ignore")
     end = offset + MOST_BYTES - NOTE
@@ -173,7 +173,7 @@ def cut(text: str, offset: int, job: str) -> str:
 
 def place_of(tool: str, arguments: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """Returns the interpreter and the variables of the process of a call: those of the operators of its recording, in
-    the environment of the operator whose calls it makes. Raises `Refused`."""
+    the environment of the operator whose calls it makes. Raises `CallFailed`."""
     from dataflow.recording import Recording, RecordingError
     from dataflow.reexecution.recorded_run import ReplayError, resolved_graph
 
@@ -186,7 +186,7 @@ def place_of(tool: str, arguments: Mapping[str, Any]) -> tuple[str, dict[str, st
     except RecordingError:  # the process of the call reports it
         graph = None
     except (EnvError, ReplayError) as error:
-        raise Refused(str(error)) from None
+        raise CallFailed(str(error)) from None
     variables = environment(1 if graph is None else graph.threads)
     return (sys.executable, variables) if env is None else (env.python, env.variables(variables))
 
@@ -210,7 +210,7 @@ def _env_of(tool: str, arguments: Mapping[str, Any], recording: Recording, graph
 def answered_there(part: Callable[..., Any], arguments: Mapping[str, Any], say: Callable[[str], None]) -> Any:
     """Answers a part of a tool in the environment of its operators: in this process where it is in that.
 
-    Raises what the part raises, as `Refused` from another process, and `Refused` where there is no such environment.
+    Raises what the part raises, as `CallFailed` from another process, and `CallFailed` without such an environment.
     """
     tool = part.__name__
     python, variables = place_of(tool, arguments)
@@ -221,9 +221,9 @@ def answered_there(part: Callable[..., Any], arguments: Mapping[str, Any], say: 
     with subprocess.Popen(command, env=variables, **pipes) as process:  # it ends with the group of this one
         found = _converse(process, tool, arguments, say)
     if found is None:
-        raise Refused(f"the process of {tool} in {python} ended without an answer ({process.returncode})")
+        raise CallFailed(f"the process of {tool} in {python} ended without an answer ({process.returncode})")
     if "error" in found:
-        raise Refused(found["error"])
+        raise CallFailed(found["error"])
     return found["answer"]
 
 

@@ -14,7 +14,7 @@ from sys import modules
 from typing import TYPE_CHECKING
 
 from dataflow.debugging.debugger import Debugger
-from dataflow.debugging.fired import Fired
+from dataflow.debugging.fired import RepeatedCall
 from dataflow.debugging.suspects import recorded_code, recorded_text
 from dataflow.environments import EnvError
 from dataflow.execution.failure import OperatorFailure, readable
@@ -33,7 +33,7 @@ EQUAL = ("use", "params", "inputs", "env")
 
 
 @dataclass
-class Others:
+class OtherOperators:
     """The operators besides the mended one, and what that is given. `reasons`: why the fix is not proven, by operator;
     `unrepeated`: those that do not repeat with the code that was recorded either, and why that is known."""
 
@@ -51,11 +51,13 @@ class Changes:
     raised: list[tuple[int, str]] = field(default_factory=list)
 
 
-def changes_of(debugger: Debugger, may: Callable[[Fired], bool], may_raise: Callable[[Fired], bool]) -> Changes:
+def changes_of(
+    debugger: Debugger, may: Callable[[RepeatedCall], bool], may_raise: Callable[[RepeatedCall], bool]
+) -> Changes:
     """Makes all calls of an operator. `may` and `may_raise` say of one that differs whether that is allowed."""
     found = Changes()
 
-    def visit(each: Fired) -> bool:
+    def visit(each: RepeatedCall) -> bool:
         if not each.same:
             found.changed.append(each.number)
             if each.raised is not None and not may_raise(each):
@@ -79,10 +81,10 @@ def unmade(verification: Verification) -> str:
     return f"{count:,} of {verification.firings:,} calls could not be made again ({why})"
 
 
-def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str) -> Others:
+def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str) -> OtherOperators:
     """Judges a verification of all operators with a fix, in the code or the graph, of the one that is `mended`."""
     recorded = graph_that_is_here(recording)[0]
-    others = Others(dict.fromkeys(report.absent, "not re-executed"))
+    others = OtherOperators(dict.fromkeys(report.absent, "not re-executed"))
     following = list[str]()
     for v in report.operators:
         name = v.operator
@@ -103,7 +105,7 @@ def judge(recording: Recording, report: VerifyReport, graph: Graph, mended: str)
 
 
 def _judge_culprit(
-    others: Others, recording: Recording, report: VerifyReport, recorded: Graph, graph: Graph, v: Verification
+    others: OtherOperators, recording: Recording, report: VerifyReport, recorded: Graph, graph: Graph, v: Verification
 ) -> None:
     """Judges an operator that differs although it was given what was recorded."""
     how = {False: "differs each time", True: "differs alike each time", None: "differs"}[report.repeats(v.operator)]

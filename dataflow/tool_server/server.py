@@ -13,7 +13,7 @@ from mcp.server.mcpserver.exceptions import ToolError
 from pydantic import ValidationError
 
 from dataflow.graph.problems import did_you_mean
-from dataflow.tool_server.jobs import MOST_BYTES, Jobs, Refused
+from dataflow.tool_server.jobs import MOST_BYTES, CallFailed, Jobs
 from dataflow.tool_server.tools import TOOLS
 
 INSTRUCTIONS = f"""\
@@ -96,7 +96,7 @@ def _served(tool: Callable[..., Any], jobs: Jobs) -> Callable[..., Awaitable[str
                 asked = functools.partial(jobs.job, str(arguments.pop("id")), **arguments)
                 return await asyncio.to_thread(asked)
             return await asyncio.to_thread(jobs.call, tool.__name__, arguments)
-        except Refused as error:
+        except CallFailed as error:
             raise ToolError(str(error)) from None
 
     del call.__wrapped__

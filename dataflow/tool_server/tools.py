@@ -15,7 +15,7 @@ from dataflow.execution.failure import cut
 
 if TYPE_CHECKING:
     from dataflow.debugging.debugger import Debugger
-    from dataflow.debugging.fired import Fired
+    from dataflow.debugging.fired import RepeatedCall
     from dataflow.graph import Graph
     from dataflow.recording import Recording
     from dataflow.tool_server.proof import Changes
@@ -139,7 +139,7 @@ def history(recording: str, operator: str, field: str, first: int = 0, last: int
         values: list[dict[str, Any]] = []
         before: Any = None
 
-        def visit(fired: Fired) -> bool:
+        def visit(fired: RepeatedCall) -> bool:
             nonlocal before
             try:
                 value = eval(code, fired.names())
@@ -468,7 +468,7 @@ def _with(graph: Graph | None, recording: Recording, operator: str, params: Mapp
     return replace(graph, nodes={**graph.nodes, node.name: replace(node, params=changed)})
 
 
-def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
+def _at(debugger: Debugger, origin: int, call: CallName) -> RepeatedCall:
     if call == "diff":
         if (found := debugger.first_difference()) is not None:
             return found
@@ -485,7 +485,7 @@ def _at(debugger: Debugger, origin: int, call: CallName) -> Fired:
     return debugger.goto(number)
 
 
-def _shown(fired: Fired, debugger: Debugger, origin: int) -> dict[str, Any]:
+def _shown(fired: RepeatedCall, debugger: Debugger, origin: int) -> dict[str, Any]:
     given = {m.port: _fields(m.here) for m in fired.made}
     more = {"of": len(debugger.calls), "made": given} | _not_made(debugger)
     return fired.as_json(debugger.node.name, origin) | more
@@ -500,7 +500,7 @@ def _fields(message: Any) -> Any:
     return None if message is None else {name: _text(value) for name, value in message.items()}
 
 
-def _names(fired: Fired) -> dict[str, Any]:
+def _names(fired: RepeatedCall) -> dict[str, Any]:
     before, after = fired.states()
     return fired.names() | {"before": before, "after": after}
 
@@ -549,7 +549,7 @@ def _named_in(expression: str) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(expression, mode="eval")) if isinstance(node, ast.Name)}
 
 
-def _is_true_then(code: Any, fired: Fired) -> bool:
+def _is_true_then(code: Any, fired: RepeatedCall) -> bool:
     """Returns whether an expression is true of a call as it was recorded, or only because it differs from that, as far
     as that is known: not what is in the state behind it, nor what is in no recorded stream."""
     names = fired.names_then() | {"before": fired.states()[0], "after": object()}

@@ -134,7 +134,7 @@ class Bus:
     # Requests
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], object]) -> Token:
-        """Hands every request for `key` to `answer`, on Zenoh's thread; it (or who it hands it on to) replies once."""
+        """Hands every request for `key` to `answer`, on Zenoh's thread; it (or what it passes it to) replies once."""
         return self._keep(
             Token(self.session.declare_queryable(key, zenoh.handlers.Callback(answer, indirect=False), complete=True))
         )

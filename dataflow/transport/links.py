@@ -84,7 +84,7 @@ class Outgoing:
 
     def take_leave(self, life: int) -> None:
         """The consumer that was the process `life` in its place has died: what was meant for it is not sent any more.
-        This may be heard late, when another process is there already."""
+        This may arrive late, when another process is there already."""
         self._new_reader()
         if self._reader <= life:
             self.away = True

@@ -185,12 +185,12 @@ class SharedPool:
             return released + sum(length for _, length in self._gaps)
 
     def consumers(self) -> set[Claim]:
-        """Returns those who hold blocks."""
+        """Returns the holders of blocks."""
         with self._lock:
             return {c for blocks in self._out.values() for b in blocks for c in b.claims if not b.free()}
 
     def close(self) -> None:
-        """Gives the memory back. Consumers that have mapped it keep what they hold, as does who holds arrays here."""
+        """Gives the memory back. Consumers that have mapped it keep what they hold, as do holders of arrays here."""
         with self._lock:
             self._closed = True
             self._view.release()

@@ -12,8 +12,8 @@ from dataflow.recording import Recording
 from dataflow.recording.layout import CUT, OUTCOME, TOLD
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
-from dataflow.verification.books import Books
 from dataflow.verification.ledger import COMPLETE
+from dataflow.verification.record_totals import GraphRecordTotals
 
 
 def chosen_operators(graph: Graph, first: str | None, only: Collection[str] | None) -> set[str]:
@@ -123,7 +123,7 @@ def require_records(recording: Recording, recorded: Collection[str], operators: 
         )
 
 
-def require_ports(recording: Recording, graph: Graph, books: Books, operators: Iterable[str]) -> None:
+def require_ports(recording: Recording, graph: Graph, books: GraphRecordTotals, operators: Iterable[str]) -> None:
     """Raises `ReplayError` for the first operator whose outputs are not those it was recorded with."""
     for name in operators:
         node, recorded = graph.nodes[name], books.of(name).ports
@@ -135,7 +135,7 @@ def require_ports(recording: Recording, graph: Graph, books: Books, operators: I
             )
 
 
-def accountable(recording: Recording, graph: Graph, books: Books, name: str) -> bool:
+def accountable(recording: Recording, graph: Graph, books: GraphRecordTotals, name: str) -> bool:
     """Returns whether the records of a node can be held against its streams.
 
     Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
@@ -150,7 +150,7 @@ def accountable(recording: Recording, graph: Graph, books: Books, name: str) -> 
 
 
 def stored_checks(
-    recording: Recording, graph: Graph, books: Books, nodes: Iterable[str]
+    recording: Recording, graph: Graph, books: GraphRecordTotals, nodes: Iterable[str]
 ) -> tuple[list[str], tuple[str, ...]]:
     """The recorded streams of `nodes` that can be compared with their records, and those that cannot be read as the
     messages that they were."""

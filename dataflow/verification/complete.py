@@ -28,9 +28,9 @@ from dataflow.sinks.recorder import RecorderSink
 from dataflow.supervision.core.report import Watch
 from dataflow.supervision.replay import plan_replay
 from dataflow.sync import Entry
-from dataflow.verification.books import Books, Places
 from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
+from dataflow.verification.record_totals import GraphRecordTotals, MessageSet
 from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.processes import Call, call_workers
 
@@ -140,7 +140,7 @@ def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             recording, graph, feeding, log, made=store.take, read=store.take, ended=store.sink.end, watcher=board
         )
         results = work.run(until=lambda: any(runner.result.first for runner in work.runners.values()))
-        ledger = read_ledger(recording, graph, Books(log, graph), feeding.operators)
+        ledger = read_ledger(recording, graph, GraphRecordTotals(log, graph), feeding.operators)
         for result in results.values():
             ledger.enter(result)
         kept = store.keep(recording)
@@ -183,7 +183,7 @@ class _Store:
             for place in origin.file.attachments:
                 self.sink.writer.add_attachment(origin.file.attachment(place))
         self._copied = 0
-        self._taken = {stream: Places() for stream in self.streams}
+        self._taken = {stream: MessageSet() for stream in self.streams}
         for said, line in recording.logs():
             self.sink.writer.write_log(said, line)
         for stream in sorted(recording.streams.keys() - {*graph.streams, logs_topic(graph.namespace)}):

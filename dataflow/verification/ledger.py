@@ -1,4 +1,4 @@
-"""The books of a recording: the messages that its nodes made against the firing records that tell of them.
+"""The accounts of a recording: the messages that its nodes made against their firing records.
 
 A message without a record shows that records were lost, however whole the others look. Where a recording ends before
 its run did (its writer was killed, the run failed), that is a *cut*: what lies after it cannot be verified.
@@ -14,7 +14,7 @@ from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME, RECOVERED
 from dataflow.recording.streams.cutting import Cut, cut_of
 from dataflow.records.comparison import Verification
-from dataflow.verification.books import Books
+from dataflow.verification.record_totals import GraphRecordTotals
 
 COMPLETE = "complete"
 
@@ -62,7 +62,7 @@ class Ledger:
             verification.unfinished = not account.finished and self.part is None
 
 
-def read_ledger(recording: Recording, graph: Graph, books: Books, nodes: Collection[str]) -> Ledger:
+def read_ledger(recording: Recording, graph: Graph, books: GraphRecordTotals, nodes: Collection[str]) -> Ledger:
     """The accounts of `nodes`. Raises `RecordingError` for records that cannot be read."""
     for name in graph.nodes:
         books.of(name)
@@ -72,11 +72,13 @@ def read_ledger(recording: Recording, graph: Graph, books: Books, nodes: Collect
     return Ledger(accounts, not torn and part is None and outcome == COMPLETE, torn, part)
 
 
-def incomplete_streams(recording: Recording, graph: Graph, books: Books, nodes: Iterable[str]) -> frozenset[str]:
-    """The recorded streams of operators among `nodes` that lack messages their firing records tell of.
+def incomplete_streams(
+    recording: Recording, graph: Graph, books: GraphRecordTotals, nodes: Iterable[str]
+) -> frozenset[str]:
+    """The recorded streams of operators among `nodes` that lack messages that are in their firing records.
 
     A record is stored before its message, so a process that is killed leaves records of messages that went no further
-    than to its own operators. What took them can be repeated all the same: the records tell how to make them again.
+    than to its own operators. What took them can be repeated all the same: the records hold how to make them again.
     """
     return frozenset(
         stream
@@ -89,7 +91,7 @@ def incomplete_streams(recording: Recording, graph: Graph, books: Books, nodes: 
     )
 
 
-def _account(recording: Recording, graph: Graph, books: Books, node: str) -> Account:
+def _account(recording: Recording, graph: Graph, books: GraphRecordTotals, node: str) -> Account:
     unaccounted = not_stored = 0
     book = books.of(node)
     for stream, made in book.made.items():

@@ -43,7 +43,7 @@ class StandIn:
 
     @property
     def whole(self) -> bool:
-        """Its records tell of every stored message, as far as the recording goes. Missing messages are only noted."""
+        """Its records have every stored message, as far as the recording goes. Missing messages are only noted."""
         return not (self.lost_records or self.unfinished or (self.unaccounted and (self.part or not self.cut)))
 
 
@@ -98,7 +98,7 @@ class VerifyReport:
     @property
     def identical(self) -> bool:
         """True only when every firing of the run was repeated, every output was the same, bit for bit, and every
-        stored message is the one that the firing records tell of."""
+        stored message is the one in the firing records."""
         return (
             not self.cut
             and not self.absent

@@ -42,7 +42,7 @@ class Retrial:
     `repeated`: whether both times they made the same, to the end, in the process that they had. `instead` are the
     answers that count for operators rather than those of the first trial. `shared` names, by operator that makes what
     was recorded, those that share its process where it does not, or where alone it does. `wrote`: the messages that
-    operators wrote into, by operator. `overwritten`: who, of its process, wrote into what an operator was given up to
+    operators wrote into, by operator. `overwritten`: which, of its process, wrote into what an operator was given up to
     its first difference, by operator: what it had was not what was recorded.
     """
 

@@ -31,7 +31,7 @@ class StoredStream:
 
     @property
     def as_recorded(self) -> bool:
-        """Every stored message is one that its maker's records tell of. Missing ones may never have been sent."""
+        """Every stored message is one in its maker's records. Missing ones may never have been sent."""
         return not (self.changed or self.uncalled)
 
     def to_wire(self) -> dict[str, Any]:

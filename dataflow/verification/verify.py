@@ -25,7 +25,6 @@ from dataflow.records.window import records_from
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, final_stamps, graph_that_is_here, processes_of
 from dataflow.supervision.core.report import OperatorCounts, Watch
-from dataflow.verification.books import Books
 from dataflow.verification.choice import (
     accountable,
     chosen_operators,
@@ -39,6 +38,7 @@ from dataflow.verification.choice import (
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.facts import changes_of, differing_facts
 from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
+from dataflow.verification.record_totals import GraphRecordTotals
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.retrial import Retrial, Trial, mates_of, retry
 from dataflow.verification.stored import StoredStream
@@ -62,7 +62,7 @@ class _Task:
     path: Path
     graph: Graph
     records: Mapping[str, Any]
-    books: Books
+    books: GraphRecordTotals
     ledger: Ledger
     operators: tuple[str, ...]
     stood_in: tuple[str, ...]
@@ -178,7 +178,7 @@ def _prepare(
             wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
             early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
         log = _read_records(recording, played, start)
-        books = Books(log, played)
+        books = GraphRecordTotals(log, played)
         told = [n for n in played.nodes if accountable(recording, played, books, n)]
         incomplete = incomplete_streams(recording, played, books, told)
         held = recording.streams.keys() - incomplete
@@ -238,7 +238,7 @@ def _graph_here(recording: Recording) -> tuple[Graph, dict[str, str]]:
 def _parts(
     graph: Graph,
     log: FiringLog,
-    books: Books,
+    books: GraphRecordTotals,
     operators: Sequence[str],
     *,
     held: Collection[str],

@@ -16,7 +16,7 @@ from dataflow.view.drawing import plots_of, roles_of
 from dataflow.view.layout import Camera, Layout
 from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, entity_of
 from dataflow.view.scores import SCORES
-from dataflow.view.viewpoint import Outlook
+from dataflow.view.viewpoint import ViewerPose
 from dataflow.view.visualizers.scene_tree import HEIGHT, WIDTH
 
 _BACKGROUND = (24, 27, 33)
@@ -33,7 +33,7 @@ Part = rrb.View | rrb.Container
 
 
 def blueprint(
-    shown: Layout, *, outlook: Outlook | None = None, following: bool = False, scores: bool = False
+    shown: Layout, *, outlook: ViewerPose | None = None, following: bool = False, scores: bool = False
 ) -> rrb.Blueprint:
     """The views for a layout.
 
@@ -72,7 +72,7 @@ def blueprint(
     )
 
 
-def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
+def _world(shown: Layout, outlook: ViewerPose | None) -> rrb.Spatial3DView | None:
     """One 3-D view of everything with a place. Overlays stay with their images; depth gives way to clouds.
 
     None where nothing has depth or a place: colour images alone would hang in an empty world.

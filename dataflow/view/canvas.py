@@ -13,7 +13,7 @@ import rerun as rr
 
 from dataflow.messages import Message, Odometry, Pose, Transforms
 from dataflow.view import colors
-from dataflow.view.frames import FrameCycleError, Rank
+from dataflow.view.frames import FrameCycleError, FramePriority
 from dataflow.view.layout import is_truth
 from dataflow.view.scene import TIMELINE, VIEWER_LOG, Placed, SceneState
 
@@ -113,7 +113,7 @@ class Canvas:
 
         What cannot be (a frame within itself) is not drawn, and said once.
         """
-        rank = Rank.TREE if tree else Rank.TRUTH if is_truth(self.stream) else Rank.ESTIMATE
+        rank = FramePriority.TREE if tree else FramePriority.TRUTH if is_truth(self.stream) else FramePriority.ESTIMATE
         frames = parent or NAMELESS, child or NAMELESS
         try:
             pose = Placed(*frames, T_parent_child, self.stream, rank, self.stamp, self.static)

@@ -29,7 +29,7 @@ class FrameCycleError(ValueError):
     """A frame placed within itself, at once or by a chain of poses that were all given."""
 
 
-class Rank(IntEnum):
+class FramePriority(IntEnum):
     """Whose word counts when several streams place the same frame: the lowest."""
 
     TREE = 0
@@ -70,7 +70,7 @@ class _Edge:
     parent: str
     T_parent_child: Matrix
     owner: str  # "" where no stream places it
-    rank: Rank | None  # None: assumed
+    rank: FramePriority | None  # None: assumed
 
     @property
     def assumed(self) -> bool:
@@ -105,7 +105,7 @@ class FrameTree:
         return self._join_roots()
 
     def place(
-        self, parent: str, child: str, T_parent_child: Matrix, *, owner: str, rank: Rank, stamp: int
+        self, parent: str, child: str, T_parent_child: Matrix, *, owner: str, rank: FramePriority, stamp: int
     ) -> list[Change]:
         """Places `child`, by stream `owner`, at `T_parent_child` (4×4) in `parent`.
 
@@ -156,7 +156,7 @@ class FrameTree:
                 return None
             poses = self._sightings[frame, edge.owner].poses if not edge.assumed else ()
             then = next((pose for at, pose in reversed(poses) if at == stamp), None)
-            if then is None and (edge.rank not in (Rank.TREE, None) or len(poses) > 1):
+            if then is None and (edge.rank not in (FramePriority.TREE, None) or len(poses) > 1):
                 return None
             T = (edge.T_parent_child if then is None else then) @ T
             frame = edge.parent

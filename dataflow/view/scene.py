@@ -12,7 +12,7 @@ import rerun as rr
 from dataflow.messages.geometry import split_matrix
 from dataflow.video.decoder import PacketDecoder
 from dataflow.view import colors
-from dataflow.view.frames import Attach, Change, Detach, FrameTree, Matrix, NewRoot, Rank
+from dataflow.view.frames import Attach, Change, Detach, FramePriority, FrameTree, Matrix, NewRoot
 from dataflow.view.layout import Layout, is_truth
 from dataflow.view.viewpoint import Vector, Viewpoint
 
@@ -36,13 +36,13 @@ class Placed:
     child: str
     T_parent_child: Matrix
     stream: str
-    rank: Rank
+    rank: FramePriority
     stamp: int
     static: bool
 
 
 @dataclass(slots=True)
-class Unshown:
+class HiddenFrames:
     """The newest offer for each frame of streams that are not shown; an estimate goes before truth.
 
     One is taken where something shown needs it and nothing shown gives it: a hidden stream must not take the frames of
@@ -79,7 +79,7 @@ class ViewOptions:
       fit); None: as float32. `depth_block`: side (pixels) of the squares that have one depth each; 1: every pixel.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log notes it once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
-    - `point_shades`: colours that the values of a cloud's points are told apart by, which packs better; 0: all.
+    - `point_shades`: colours that distinguish the values of a cloud's points, which packs better; 0: all.
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
       have had a point in a cell, so that what moves leaves none.
     - `trail`: trails get a vertex every so many metres at least.
@@ -138,7 +138,7 @@ class SceneState:
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
     videos: dict[str, PacketDecoder] = field(default_factory=dict)
     """By stream, the decoder of its packets."""
-    unshown: Unshown = field(default_factory=Unshown)
+    unshown: HiddenFrames = field(default_factory=HiddenFrames)
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     begin: int | None = None
     """The stamp (ns) of the first message that was drawn."""
@@ -208,7 +208,7 @@ class SceneState:
     def _take_unshown(self, recording: rr.RecordingStream, child: str, stamp: int) -> None:
         offer = self.unshown.needed(self.tree, child, stamp)
         if offer is not None and (offer.stamp == stamp or self.tree.owner(child) is None):
-            rank = Rank.TREE if offer.rank is Rank.TREE else Rank.UNSHOWN
+            rank = FramePriority.TREE if offer.rank is FramePriority.TREE else FramePriority.UNSHOWN
             self._place(recording, replace(offer, rank=rank, stamp=stamp))
 
     def draw_frames(

@@ -33,7 +33,7 @@ from dataflow.view.process import LOOPBACK, ViewerError
 from dataflow.view.scene import SCENE, VIEWER_LOG, SceneState, ViewOptions, entity_of
 from dataflow.view.scores import SCORES, Summaries, document, scores_of
 from dataflow.view.targets import GRPC_PORT, Connect, Save, Serve, Spawn, Target
-from dataflow.view.viewpoint import Outlook
+from dataflow.view.viewpoint import ViewerPose
 
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
@@ -93,7 +93,7 @@ class ViewerSink:
         self._reported: set[tuple[str, str]] = set()
         self._started_at: int | None = None
         self._graph: Graph | None = None
-        self._outlook: Outlook | None = None
+        self._outlook: ViewerPose | None = None
         self._seen: set[str] = set()
         self._scores: Summaries = {}
         self._laid_out = False

@@ -26,7 +26,7 @@ MOST_PLACES = 2048
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class ViewerPose:
     """A viewpoint in the drawing frame, metres. `up` is a unit vector along an axis."""
 
     up: Vector
@@ -36,7 +36,7 @@ class Outlook:
 
 @dataclass(slots=True)
 class Viewpoint:
-    """Frames, ranges and positions that messages have told of so far."""
+    """Frames, ranges and positions that messages have given so far."""
 
     optical: dict[str, None] = field(default_factory=dict)
     """Optical frames, in the order in which they came."""
@@ -59,7 +59,7 @@ class Viewpoint:
             self._ranges.append(float(np.median(d)))
 
     def saw_points(self, T: Vector | None, points: npt.ArrayLike) -> None:
-        """Points (N, 3) of a cloud in its sensor's frame tell how far things are; with the frame's pose `T` in the root
+        """Points (N, 3) of a cloud in its sensor's frame show how far things are; with the frame's pose `T` in the root
         frame, those of a scan all round also where the place is, and the newest what there is at the end."""
         p = np.asarray(points, np.float64).reshape(-1, 3)
         distances = np.linalg.norm(p, axis=1)
@@ -93,7 +93,7 @@ class Viewpoint:
         p = np.asarray(points, np.float64).reshape(-1, 3)
         self._kept.append(p[:: max(len(p) // 64, 1)])
 
-    def outlook(self, tree: FrameTree, *, whole: bool = False) -> Outlook:
+    def outlook(self, tree: FrameTree, *, whole: bool = False) -> ViewerPose:
         """Chooses the viewpoint from which everything seen is in view. `whole`: the run is over.
 
         From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
@@ -110,7 +110,7 @@ class Viewpoint:
         else:
             robot = next((T for frame in self.posed if (T := tree.pose(frame)) is not None), None)
             if robot is None and not self._ranges:
-                return Outlook(up)
+                return ViewerPose(up)
             at, ahead = (np.zeros(3), np.eye(3)[0]) if robot is None else (robot[:3, 3], robot[:3, 0])
         level = ahead - up * (ahead @ up)
         if np.linalg.norm(level) < 0.2:
@@ -129,7 +129,7 @@ class Viewpoint:
             beside = 0.0 if clouds else (reach if self._ranges else 1.0)  # what was seen on the way lies beside it
             return _fitted(np.concatenate([*_usual(clouds, 3), *_usual(way, 1)]), axes, beside)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
-        return Outlook(up, position, at + level * (0.75 * reach))
+        return ViewerPose(up, position, at + level * (0.75 * reach))
 
 
 def _usual(sets: list[Vector], share: float) -> list[Vector]:
@@ -141,7 +141,7 @@ def _usual(sets: list[Vector], share: float) -> list[Vector]:
     return [np.clip(points, lower, upper)]
 
 
-def _fitted(points: Vector, axes: Vector, beside: float) -> Outlook:
+def _fitted(points: Vector, axes: Vector, beside: float) -> ViewerPose:
     """The nearest viewpoint in a fixed direction from which all points (N, 3) are in view, and `beside` metres farther.
 
     `axes` are the unit vectors ahead, up and to the side. A point at depth q along the view and height h in the image
@@ -162,7 +162,7 @@ def _fitted(points: Vector, axes: Vector, beside: float) -> Outlook:
         target += axis * ((above - below) / 2 * tangent)
         distance = max(distance, (above + below) / 2)
     distance = min(max(distance + beside, away), 2 * away * FARTHEST)
-    return Outlook(axes[1], target + distance * back, target)
+    return ViewerPose(axes[1], target + distance * back, target)
 
 
 def _extent(places: list[Vector], up: Vector) -> float:

@@ -48,7 +48,7 @@ LOST = 0.1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fitted:
+class CameraCalibration:
     """A camera's calibration.
 
     `views` are those it is fitted to, with `T_camera_board` (V, 4, 4), `distances` (V,) in metres, the mean depth of
@@ -95,7 +95,9 @@ def _distance(a: View, b: View) -> float:
     return float(np.linalg.norm(a.pixels[i] - b.pixels[j], axis=1).mean()) if len(i) else float("inf")
 
 
-def fit_camera(board: Board, views: Sequence[View], frame: str, size: tuple[int, int], model: Model) -> Fitted:
+def fit_camera(
+    board: Board, views: Sequence[View], frame: str, size: tuple[int, int], model: Model
+) -> CameraCalibration:
     """Returns the calibration of images of `size` (width, height); views that fit much worse than the others are left
     out once.
 
@@ -113,7 +115,7 @@ def fit_camera(board: Board, views: Sequence[View], frame: str, size: tuple[int,
     return replace(fitted, left_out=int((~keep).sum()))
 
 
-def _fit(board: Board, views: Sequence[View], frame: str, size: tuple[int, int], model: Model) -> Fitted:
+def _fit(board: Board, views: Sequence[View], frame: str, size: tuple[int, int], model: Model) -> CameraCalibration:
     points = [board.points[view.ids] for view in views]
     try:
         K, D, rotations, translations = _solved(points, [view.pixels for view in views], size, model)
@@ -139,7 +141,7 @@ def _fit(board: Board, views: Sequence[View], frame: str, size: tuple[int, int],
             "tilt, at several distances"
         )
     info = CameraInfo(stamp=0, frame=frame, width=size[0], height=size[1], distortion_model=model, K=K, distortion=D)
-    return Fitted(info, tuple(views), poses, np.array(depths), off, errors, deviations, 0)
+    return CameraCalibration(info, tuple(views), poses, np.array(depths), off, errors, deviations, 0)
 
 
 def _deviations(
@@ -197,12 +199,12 @@ def projected(points: Points, K: NDArray[np.float64], D: NDArray[np.float64], mo
     return np.asarray(found, np.float64).reshape(-1, 2)
 
 
-def tilts(fitted: Fitted) -> NDArray[np.float64]:
+def tilts(fitted: CameraCalibration) -> NDArray[np.float64]:
     """Returns the angle between the board and the image plane in each view, radians."""
     return np.asarray(np.arccos(np.clip(np.abs(fitted.T_camera_board[:, 2, 2]), 0, 1)))
 
 
-def warnings_of(fitted: Fitted) -> list[str]:
+def warnings_of(fitted: CameraCalibration) -> list[str]:
     """Returns what makes the calibration poor, each with what would mend it."""
     found = []
     if len(fitted.views) < FEW:

@@ -54,7 +54,7 @@ class Turning:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mounted:
+class CameraImuCalibration:
     """The camera beside the IMU.
 
     `R_imu_camera` (3, 3) maps the camera's coordinates to the IMU's, `offset` is by how many seconds the images' stamps
@@ -123,7 +123,7 @@ class _Gyroscope:
         return np.asarray((first.inv() * last).as_rotvec(), np.float64)
 
 
-def fit_mount(camera: Turning, seconds: Array, rates: Array) -> Mounted:
+def fit_mount(camera: Turning, seconds: Array, rates: Array) -> CameraImuCalibration:
     """Returns how the camera is mounted beside a gyroscope with samples (M, 3) in rad/s at `seconds` (M,).
 
     Raises ValueError where too little was seen, or the two do not turn alike.
@@ -166,7 +166,7 @@ def fit_mount(camera: Turning, seconds: Array, rates: Array) -> Mounted:
         )
     noise = (1.4826 * float(np.median(np.abs(rest)))) ** 2
     covariance = noise * np.linalg.pinv(found.jac.T @ found.jac)
-    return Mounted(
+    return CameraImuCalibration(
         R_imu_camera=nearest_rotation(Rotation.from_rotvec(found.x[:3]).as_matrix() @ R_start),
         offset=offset,
         bias=found.x[3:6],
@@ -188,7 +188,7 @@ def _aligned(camera: Array, imu: Array) -> tuple[Matrix, float]:
     return R, float(((b - a @ R.T) ** 2).sum())
 
 
-def warnings_of(mounted: Mounted) -> list[str]:
+def warnings_of(mounted: CameraImuCalibration) -> list[str]:
     """Returns what makes the calibration poor, each with what would mend it."""
     found = []
     if mounted.turning[2] < LITTLE:

@@ -24,10 +24,10 @@ from dataflow.recording import RecordingError
 from operators.calibration import camera_imu as mounts
 from operators.calibration import coverage, stereo
 from operators.calibration.boards import Board, Charuco, Chessboard
-from operators.calibration.camera import BLURRED, MODELS, Fitted, Model, different, tilts
+from operators.calibration.camera import BLURRED, MODELS, CameraCalibration, Model, different, tilts
 from operators.calibration.recorded import (
     Along,
-    Seen,
+    BoardViews,
     images_looked_at,
     images_of,
     intrinsics_of,
@@ -281,7 +281,7 @@ def _places(folder: Path, names: Sequence[str], overwrite: bool) -> list[Path]:
 # ------------------------------------------------------------------------------------------------------- outcomes
 
 
-def _pair(both: Sequence[Seen], kept: Sequence[Fitted], tolerance: float) -> stereo.Pair:
+def _pair(both: Sequence[BoardViews], kept: Sequence[CameraCalibration], tolerance: float) -> stereo.Pair:
     """The pair of two cameras, from their views at the same time. Raises ValueError."""
     left, right = both
     if left.size != right.size:
@@ -292,7 +292,9 @@ def _pair(both: Sequence[Seen], kept: Sequence[Fitted], tolerance: float) -> ste
     return stereo.fit_pair(left.board, pairs, kept[0].info, kept[1].info)
 
 
-def _write_camera(files: Sequence[Path], seen: Seen, fitted: Fitted, info: CameraInfo, recording: Path) -> None:
+def _write_camera(
+    files: Sequence[Path], seen: BoardViews, fitted: CameraCalibration, info: CameraInfo, recording: Path
+) -> None:
     text, picture = files
     covered = seen.covered(fitted)
     notes = [
@@ -314,7 +316,7 @@ def _write_transform(
     file.write_text(transforms_text(transforms, notes), encoding="utf-8")
 
 
-def _camera_words(seen: Seen, fitted: Fitted) -> list[str]:
+def _camera_words(seen: BoardViews, fitted: CameraCalibration) -> list[str]:
     info, spread = fitted.info, fitted.deviations
     about = [f" ± {value:.2f}" for value in spread] if spread is not None else [""] * 4
     away, odd = fitted.distances, f", {fitted.left_out} odd ones left out" if fitted.left_out else ""
@@ -331,7 +333,7 @@ def _camera_words(seen: Seen, fitted: Fitted) -> list[str]:
     ]
 
 
-def _camera_json(seen: Seen, fitted: Fitted) -> dict[str, Any]:
+def _camera_json(seen: BoardViews, fitted: CameraCalibration) -> dict[str, Any]:
     info, covered = fitted.info, seen.covered(fitted)
     return {
         "stream": seen.name,
@@ -378,7 +380,7 @@ def _rows(pair: stereo.Pair) -> float:
     return float(np.sqrt((pair.rows**2).mean()))
 
 
-def _late(found: mounts.Mounted) -> str:
+def _late(found: mounts.CameraImuCalibration) -> str:
     word = "later" if found.offset >= 0 else "earlier"
     return (
         f"images are stamped {abs(1e3 * found.offset):.2f} ± {1e3 * found.offset_deviation:.2f} ms {word} than "
@@ -386,7 +388,7 @@ def _late(found: mounts.Mounted) -> str:
     )
 
 
-def _mount_words(found: mounts.Mounted) -> list[str]:
+def _mount_words(found: mounts.CameraImuCalibration) -> list[str]:
     rows = "; ".join(" ".join(f"{value:+.4f}" for value in row) for row in found.R_imu_camera.tolist())
     turning = ", ".join(f"{math.degrees(value):.1f}" for value in found.turning)
     return [
@@ -398,7 +400,7 @@ def _mount_words(found: mounts.Mounted) -> list[str]:
     ]
 
 
-def _mount_json(found: mounts.Mounted) -> dict[str, Any]:
+def _mount_json(found: mounts.CameraImuCalibration) -> dict[str, Any]:
     return {
         "R_imu_camera": found.R_imu_camera.tolist(),
         "rotation_deviation": found.rotation_deviation,

@@ -17,14 +17,14 @@ from dataflow.api.stream import RecordedStream
 from dataflow.messages import CameraInfo, CompressedImage, Image, Message
 from operators.calibration import coverage
 from operators.calibration.boards import Board, View
-from operators.calibration.camera import BLURRED, Fitted, Model, different, fit_camera, warnings_of
+from operators.calibration.camera import BLURRED, CameraCalibration, Model, different, fit_camera, warnings_of
 
 Along = Callable[[list[int], str], Iterable[int]]
 """Gives places one by one, with a display of how far it is under a name."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class BoardViews:
     """The images of a stream, of `size` (width, height), `looked` of all `there`, and their `views` of a board."""
 
     name: str
@@ -40,7 +40,7 @@ class Seen:
         """Views that are too blurred to be used."""
         return sum(view.blur > BLURRED for view in self.views)
 
-    def fit(self, model: Model) -> Fitted:
+    def fit(self, model: Model) -> CameraCalibration:
         """Returns the camera's calibration. Raises ValueError, with what the images showed."""
         try:
             return fit_camera(self.board, different(self.views, self.size[0]), self.frame, self.size, model)
@@ -50,11 +50,11 @@ class Seen:
                 f"{self.blurred} blurred, the others alike)"
             ) from error
 
-    def covered(self, fitted: Fitted) -> NDArray[np.int32]:
+    def covered(self, fitted: CameraCalibration) -> NDArray[np.int32]:
         """Returns the number of views (H, W) with the board at each pixel."""
         return coverage.counts(fitted.views, self.size)
 
-    def warnings(self, fitted: Fitted) -> list[str]:
+    def warnings(self, fitted: CameraCalibration) -> list[str]:
         """Returns what makes the calibration poor, each with what would mend it."""
         found = warnings_of(fitted)
         if self.blurred > len(self.views) / 4:
@@ -95,7 +95,7 @@ def spaced_pairs(left: RecordedStream, right: RecordedStream, every: float, tole
     return [chosen.tolist(), np.unique(beside[chosen]).tolist()]
 
 
-def look(board: Board, stream: RecordedStream, places: list[int], along: Along) -> Seen:
+def look(board: Board, stream: RecordedStream, places: list[int], along: Along) -> BoardViews:
     """Returns what images of a stream, at `places` in it, show of a board.
 
     Raises ValueError where images differ in size, none can be read, or none shows the board.
@@ -118,10 +118,10 @@ def look(board: Board, stream: RecordedStream, places: list[int], along: Along) 
         raise ValueError(
             f"{name}: no board in {images_looked_at(looked, len(stream))}: are its counts right ({board})?"
         )
-    return Seen(name, frame, board, size, looked, tuple(views), len(stream))
+    return BoardViews(name, frame, board, size, looked, tuple(views), len(stream))
 
 
-def own_frames(left: Seen, right: Seen) -> tuple[Seen, Seen]:
+def own_frames(left: BoardViews, right: BoardViews) -> tuple[BoardViews, BoardViews]:
     """Returns both cameras with different frames: where they have the same, the parts of their streams' names
     that differ, such as `left` and `right`."""
     if left.frame != right.frame:

@@ -1,7 +1,7 @@
 """Searches planes along and across gravity in a cloud, by random sampling with a known direction of up.
 
 The up direction leaves one number open for a level plane and two for an upright one, so a sample is one point or two:
-few trials find every plane, and the noise of normals only decides who may vote. Fischler and Bolles, "Random sample
+few trials find each plane, and the noise of normals decides only which points vote. Fischler and Bolles, "Random sample
 consensus", 1981; voting by normals as in Schnabel, Wahl and Klein, "Efficient RANSAC", 2007.
 """
 
@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 Kind = Literal["level", "upright"]
 
 ASKEW = math.radians(6)  # a plane so near to the direction of walls has it
-_ELECTORATE = 2000  # so many points are enough to tell the best of the samples; all fit the plane afterwards
+_ELECTORATE = 2000  # so many points are enough to find the best of the samples; all fit the plane afterwards
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _best_sample(
 def _refined(
     scene: Scene, search: Search, kind: Kind, index: Indices, normal: Array, d: float, keeps_normal: bool
 ) -> tuple[Array, float, Indices]:
-    """Fits the plane to its voters and asks again who they are, a few times; only its place if it `keeps_normal`."""
+    """Fits the plane to its voters and finds these again, a few times; only its place if it `keeps_normal`."""
     on = index
     for _ in range(4):
         near = np.abs(scene.points[index] @ normal + d) <= scene.tolerance[index]

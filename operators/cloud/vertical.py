@@ -90,7 +90,7 @@ def accelerated(force: Array) -> tuple[Array, Array]:
 def find_vertical(points: NDArray[np.float32], expected: Array, information: Array) -> Vertical | None:
     """Returns the vertical of points (N, 3), metres, in their sensor's frame; None where they show too few surfaces.
 
-    Most surfaces that people build are level or upright, so the directions of the normals tell where up is. Those that
+    Most surfaces that people build are level or upright, so the directions of the normals show where up is. Those that
     are seen, and those square to two of them, are rated by the normals along them and across them, each direction of
     normals once, and by `expected` (3,), where up is likely, with its `information` (3, 3), rad^-2: how cameras are
     held, or what an accelerometer measured. Walls are likely square to each other, ceilings seldom seen, cameras seldom

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, RelativeDepth
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import Counts, In, Operator, Out, Param, Sampled
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.inference import ModelError, Provider, open_session
 from operators.models.use import use_model
 from operators.network_input import NORMALIZATIONS, image_input, three_channels
@@ -203,7 +203,7 @@ class MonoDepth(Operator):
         """
         color = three_channels(pixels)
         image, size = (color.shape[1], color.shape[0]), self._input.size
-        fit = Fit.plan("stretch" if self._focal is None else "letterbox", image, size)
+        fit = ImageFit.plan("stretch" if self._focal is None else "letterbox", image, size)
         smaller = image[0] >= fit.inner[0] and image[1] >= fit.inner[1]
         inner = cv2.resize(color, fit.inner, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
         tensor = self._input.tensor(fit.framed(np.asarray(inner, np.uint8)))

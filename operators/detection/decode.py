@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image, pack_masks
-from operators.image.letterbox import Fit, FitMode
+from operators.image.letterbox import FitMode, ImageFit
 
 Size = tuple[int, int]
 """(width, height) in pixels."""
@@ -37,7 +37,7 @@ class Candidates:
 Outputs = Sequence[NDArray[Any]]
 Decode = Callable[[Outputs, Size, float], Candidates]
 """(outputs, input size, score threshold) → candidates. Raises ValueError for outputs of another shape."""
-Draw = Callable[[Candidates, Outputs, Fit], NDArray[np.bool_]]
+Draw = Callable[[Candidates, Outputs, ImageFit], NDArray[np.bool_]]
 """(candidates, outputs, fit) → their masks (N, height, width) in the pixels of the image."""
 
 

@@ -15,7 +15,7 @@ from operators.detection.decode import Candidates, Layout, Outputs
 from operators.detection.decoders import LAYOUTS, DecoderName
 from operators.detection.nms import class_wise_nms
 from operators.detection.open_input import opened
-from operators.image.letterbox import Fit, FitMode
+from operators.image.letterbox import FitMode, ImageFit
 from operators.inference import ModelError, Provider, open_content, open_session
 from operators.language.bpe import Tokenizer
 from operators.model_metadata import told
@@ -134,12 +134,12 @@ class ExportedFinder:
         answers = self._answers(tensors)
         return [self._read(each, fit, threshold, nms_iou, most) for each, fit in zip(answers, fits, strict=True)]
 
-    def _fitted(self, image: NDArray[np.uint8]) -> Fit:
+    def _fitted(self, image: NDArray[np.uint8]) -> ImageFit:
         """Returns how an image (H, W, 3) goes in: an input that was opened holds one row of cells of padding, no more.
 
         Without any, networks that learned with padding find other things at its border.
         """
-        fit = Fit.plan(self._fit, (image.shape[1], image.shape[0]), self._input.size)
+        fit = ImageFit.plan(self._fit, (image.shape[1], image.shape[0]), self._input.size)
         if not self._opened or self._feed or fit.offset != (0, 0):
             return fit
         grid = self._layout.grid
@@ -159,7 +159,7 @@ class ExportedFinder:
         if any(a.ndim == 0 or len(a) != count for a in answers[0]):
             shapes = ", ".join(str(a.shape) for a in answers[0])
             raise ModelError(
-                f"{self._file} was given {count} images and answered {shapes}, which cannot be told apart by image; "
+                f"{self._file} was given {count} images and answered {shapes}, which cannot be divided by image; "
                 f"export it for one image at a time"
             )
         return [[a[k : k + 1] for a in answers[0]] for k in range(count)]
@@ -180,7 +180,7 @@ class ExportedFinder:
         known = [found[name] for name in self._layout.names if name in found]
         return known if known and len(known) == len(self._layout.names) else None
 
-    def _read(self, outputs: Outputs, fit: Fit, threshold: float, nms_iou: float, most: int) -> Candidates:
+    def _read(self, outputs: Outputs, fit: ImageFit, threshold: float, nms_iou: float, most: int) -> Candidates:
         try:
             found = self._layout.decode(outputs, fit.target, threshold)
         except ValueError as error:

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.decode import Candidates, Outputs
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 
 Masks = NDArray[np.bool_]
 """(N, height, width) in the pixels of the image."""
 
 
-def by_prototypes(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
+def by_prototypes(found: Candidates, outputs: Outputs, fit: ImageFit) -> Masks:
     """Combines prototypes (1, K, h, w) of the input by K coefficients a box; what lies outside the box is cut off.
 
     Source: `process_mask_native` of Ultralytics, after Bolya et al., "YOLACT", 2019.
@@ -26,13 +26,13 @@ def by_prototypes(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
     return np.stack(made) if made else _none(fit)
 
 
-def by_planes(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
+def by_planes(found: Candidates, outputs: Outputs, fit: ImageFit) -> Masks:
     """Reads logits (N, h, w) that cover the input. Source: `PostProcess` of RF-DETR's segmentation."""
     assert found.masks is not None
     return np.stack([_at_image(plane, fit) > 0 for plane in found.masks]) if len(found.masks) else _none(fit)
 
 
-def by_probabilities(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
+def by_probabilities(found: Candidates, outputs: Outputs, fit: ImageFit) -> Masks:
     """Reads probabilities (N, h, w), which cover the input, or, where they have another size, the box of each.
 
     Source: `paste_masks_in_image` of torchvision's Mask R-CNN (He et al., 2017).
@@ -46,11 +46,11 @@ def by_probabilities(found: Candidates, outputs: Outputs, fit: Fit) -> Masks:
     return np.stack([_pasted(plane, box, fit.image) for plane, box in zip(found.masks, boxes, strict=True)])
 
 
-def _none(fit: Fit) -> Masks:
+def _none(fit: ImageFit) -> Masks:
     return np.zeros((0, fit.image[1], fit.image[0]), np.bool_)
 
 
-def _at_image(plane: NDArray[np.float32], fit: Fit) -> NDArray[np.float32]:
+def _at_image(plane: NDArray[np.float32], fit: ImageFit) -> NDArray[np.float32]:
     """Returns a plane that covers the input at the size of the image, without what was only padding."""
     height, width = plane.shape
     x, y = (offset / extent for offset, extent in zip(fit.offset, fit.target, strict=True))

@@ -15,7 +15,7 @@ class Figures:
         self._figures = {}
 
     def on_reset(self, input: str) -> None:
-        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        """A clock jumped back, so stamps no longer show what belongs together: the score begins anew."""
         self.setup()
 
     def summary(self) -> Mapping[str, float | int | str]:

@@ -10,7 +10,7 @@ from dataflow.messages import Detections2D, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points, yaw_of
 from dataflow.operator import Batch, In, Operator, Param, Sampled
 from operators.labels import LabelSpace, labels_file
-from operators.scene.scoring import NodeScore, PlainlySeen, RelationScore, score_nodes
+from operators.scene.scoring import NodeScore, RelationScore, VisibleImages, score_nodes
 
 
 class SceneGraphMetrics(Operator):
@@ -42,7 +42,7 @@ class SceneGraphMetrics(Operator):
         self._begin()
 
     def _begin(self) -> None:
-        self._seen = PlainlySeen(self.visible, self.pixels, self.images)
+        self._seen = VisibleImages(self.visible, self.pixels, self.images)
         self._relations = RelationScore()
         self._T_true_graph: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None = None
         self._last: NodeScore | None = None

@@ -45,9 +45,9 @@ from operators.fusion.output import (
     well_known,
 )
 from operators.fusion.sensors.constraints import Constraints
-from operators.fusion.sensors.covariances import Unusable
+from operators.fusion.sensors.covariances import UnusableMessage
 from operators.fusion.sensors.inertial import InertialConfig, InertialSensor
-from operators.fusion.sensors.interpretation import Surroundings, measurements, turning
+from operators.fusion.sensors.interpretation import MeasurementContext, measurements, turning
 from operators.fusion.sensors.last_measurements import LastMeasurements
 from operators.fusion.sensors.lever_arms import LeverArms
 from operators.fusion.sensors.settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
@@ -193,7 +193,7 @@ class EkfFusion(Operator):
             settings = self._settings(name)
             if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
                 felt = self._feel(name, message, settings)
-        around = Surroundings(
+        around = MeasurementContext(
             self.state.lever_arms.of, self.world_frame, self.state.origin, landmark_map, self.state.ignored
         )
         for name, message in named.items():
@@ -278,7 +278,7 @@ class EkfFusion(Operator):
             raise ValueError(f"{name}: its clock is the one that offsets are related to: it has no offset_sigma")
         try:
             sample = self.state.inertial.sample(name, imu, imu.stamp - round(settings.offset * 1e9))
-        except Unusable as reason:
+        except UnusableMessage as reason:
             self.state.ignored[f"{name}: {reason}"] += 1
             return False
         self.state.lever_arms.body = imu.frame
@@ -297,7 +297,7 @@ class EkfFusion(Operator):
         self.state.ignored["begun in motion"] += int(not begun[1])
         return True
 
-    def _measure(self, name: str, message: Message, around: Surroundings) -> None:
+    def _measure(self, name: str, message: Message, around: MeasurementContext) -> None:
         if self.state.filter is None and self.motion == "constant_velocity":
             start = coasting_node(message.stamp, self._prior(), self.gravity)
             self.state.filter = ErrorStateFilter(self._config(), start)
@@ -308,7 +308,7 @@ class EkfFusion(Operator):
         before = self.state.last.before(name, message)
         if self.state.filter is None:
             self.state.ignored[f"{name}: before the beginning"] += 1
-            with suppress(Unusable):
+            with suppress(UnusableMessage):
                 for found in measurements(name, message, before, settings, around):
                     self.state.inertial.saw(*found)
             return
@@ -323,7 +323,7 @@ class EkfFusion(Operator):
                 taken = assumed if clock >= 0 else self._late(sensor)
                 self.state.filter.measure(Measurement(time - taken, sensor, model, noise, clock, taken * 1e-9))
             self.state.alarms.of_use(name)
-        except Unusable as reason:
+        except UnusableMessage as reason:
             self.state.ignored[f"{name}: {reason}"] += 1
             self.state.alarms.of_no_use(name, str(reason))
 
@@ -333,13 +333,13 @@ class EkfFusion(Operator):
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
 
     def _late(self, sensor: str) -> int:
-        """Returns by how much (ns) a sensor's stamps are found to be late, without being told."""
+        """Returns by how much (ns) a sensor's stamps are found to be late, beyond their settings."""
         found = self._filter.suspicion
         if found is None or found[:2] != (sensor, LATE) or abs(found[2]) >= self.window:
             return 0
         return round(found[2] * 1e9)
 
-    def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
+    def _command(self, name: str, message: Message, settings: SensorSettings, around: MeasurementContext) -> None:
         assert isinstance(message, Twist)
         if self.motion == "inertial":
             self.state.ignored[f"{name}: a control input beside inertial samples"] += 1

@@ -16,7 +16,7 @@ _GREY = 114  # the border that YOLO networks are trained with
 
 
 @dataclass(frozen=True)
-class Fit:
+class ImageFit:
     """An image of size `image` inside an input of size `target`, both (width, height).
 
     The image takes `inner` pixels at `offset`: all of the input when stretched, its middle when letterboxed. `scale`
@@ -30,7 +30,7 @@ class Fit:
     scale: tuple[float, float]
 
     @classmethod
-    def plan(cls, mode: FitMode, image: tuple[int, int], target: tuple[int, int]) -> Fit:
+    def plan(cls, mode: FitMode, image: tuple[int, int], target: tuple[int, int]) -> ImageFit:
         if mode == "stretch":
             return cls(image, target, target, (0, 0), (image[0] / target[0], image[1] / target[1]))
         scale = min(target[0] / image[0], target[1] / image[1])

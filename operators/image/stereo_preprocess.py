@@ -145,7 +145,7 @@ class StereoPreprocess(Operator):
         return messages | {"status": _status(left.stamp, pair.baseline, counts)}
 
     def _pair_of(self, left: CameraInfo, right: CameraInfo, extrinsics: Transforms | None) -> _Pair:
-        """Returns how the pair is prepared; that is worked out anew where it is told something else."""
+        """Returns how the pair is prepared; that is computed anew where its inputs change."""
         T_left_right = None
         if left.P is None or right.P is None:
             if extrinsics is None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 
 Affine = NDArray[np.float64]
 """(2, 3): pixel edges of the source image → pixel edges of the network's input; (0, 0) is the top left corner."""
@@ -51,7 +51,7 @@ NONE = Variation(flip=0, scale=1, shift=0, color=0, noise=0, blur=0)
 
 def fitted(image: tuple[int, int], target: tuple[int, int]) -> Affine:
     """The letterbox of an image (width, height) in the input, as the operator fits it at run time."""
-    fit = Fit.plan("letterbox", image, target)
+    fit = ImageFit.plan("letterbox", image, target)
     sx, sy = fit.inner[0] / image[0], fit.inner[1] / image[1]
     return np.array([[sx, 0, fit.offset[0]], [0, sy, fit.offset[1]]], np.float64)
 

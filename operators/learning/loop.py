@@ -80,7 +80,7 @@ class Progress(Protocol):
     def epoch(self, epoch: int, losses: Mapping[str, float], scores: Mapping[str, float] | None) -> None: ...
 
 
-class Silent:
+class NoProgress:
     """Shows nothing."""
 
     def begin(self, epochs: int, steps: int, done: int) -> None:
@@ -114,7 +114,7 @@ def train(
     With `resume`, goes on from that checkpoint. Raises TrainingFileError where the checkpoint is of other data or
     settings, and FloatingPointError where the loss is no longer a number.
     """
-    return _Run(task, settings, out, progress or Silent()).run(resume)
+    return _Run(task, settings, out, progress or NoProgress()).run(resume)
 
 
 class _Run:

@@ -31,12 +31,12 @@ Array = NDArray[np.float64]
 _FARTHEST = 1e6  # metres from the origin of a map: farther landmarks are none
 
 
-class Unusable(Exception):
+class UnusableMessage(Exception):
     """Raised for a message that is ignored; the text names the reason."""
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class LocalizationContext:
     """Holds what messages are related to: the robot, the map and what is known of its landmarks and objects.
 
     `band`: heights (m) between which points count; `points`: how many; `worth`: how many of them are independent;
@@ -68,10 +68,10 @@ MODALITIES: dict[type[Message], str] = {
 }
 
 
-def observation(name: str, message: Message, around: Surroundings) -> Observation:
+def observation(name: str, message: Message, around: LocalizationContext) -> Observation:
     """Returns a message's observation of the pose.
 
-    Raises Unusable for a message without use, ValueError for one that does not belong to this map or robot.
+    Raises UnusableMessage for a message without use, ValueError for one that does not belong to this map or robot.
     """
     if isinstance(message, PointCloud | LaserScan):
         return _scan(message, around)
@@ -85,10 +85,10 @@ def observation(name: str, message: Message, around: Surroundings) -> Observatio
     return _placed(name, message, around)
 
 
-def _scan(message: PointCloud | LaserScan, around: Surroundings) -> Scan:
+def _scan(message: PointCloud | LaserScan, around: LocalizationContext) -> Scan:
     """Points of the band, spread evenly over the directions in which there are any."""
     if around.field is None:
-        raise Unusable("no map")
+        raise UnusableMessage("no map")
     points = message.points if isinstance(message, PointCloud) else message.points()
     points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     T = transform_between(around.extrinsics, message.frame, around.base_frame)
@@ -97,15 +97,15 @@ def _scan(message: PointCloud | LaserScan, around: Surroundings) -> Scan:
     low, high = around.band
     points = points[(points[:, 2] >= low) & (points[:, 2] <= high) & (far >= around.own)]
     if len(points) < 8:
-        raise Unusable("fewer than 8 points in the band")
+        raise UnusableMessage("fewer than 8 points in the band")
     ordered = points[np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable"), :2]
     chosen = np.linspace(0, len(ordered) - 1, min(around.points, len(ordered))).astype(int)
     return Scan(around.field, ordered[chosen], around.worth)
 
 
-def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) -> Sightings:
+def _landmarks(name: str, sightings: LandmarkSightings, around: LocalizationContext) -> Sightings:
     if around.landmarks is None or around.landmarks.positions is None:
-        raise Unusable("no map of landmarks")
+        raise UnusableMessage("no map of landmarks")
     _same_frame(name, "the map of landmarks", around.landmarks.frame, around.map_frame)
     if sightings.covariances is None:
         raise ValueError(f"{name}: sightings have no covariances: how well a landmark was seen must be known")
@@ -117,9 +117,9 @@ def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) ->
     return _sightings(seen, spread, places, sightings.frame, around)
 
 
-def _objects(boxes: Boxes3D, around: Surroundings) -> Sightings:
+def _objects(boxes: Boxes3D, around: LocalizationContext) -> Sightings:
     if around.objects is None:
-        raise Unusable("no map of objects")
+        raise UnusableMessage("no map of objects")
     _same_frame("objects", "their map", around.objects.frame, around.map_frame)
     by_class: dict[str, Array] = {}
     flat, placed = _placed_at(around.objects.centers)
@@ -139,7 +139,9 @@ def _placed_at(positions: Array) -> tuple[Array, NDArray[np.bool_]]:
     return flat, np.asarray((np.abs(flat) < _FARTHEST).all(axis=1))  # not where a coordinate is not finite
 
 
-def _sightings(seen: Array, spread: Array, places: list[Array | None], frame: str, around: Surroundings) -> Sightings:
+def _sightings(
+    seen: Array, spread: Array, places: list[Array | None], frame: str, around: LocalizationContext
+) -> Sightings:
     """Sightings in the plane of the robot, of what is usable and in the map."""
     T = transform_between(around.extrinsics, frame, around.base_frame)
     flat = transform_points(T, seen)[:, :2]
@@ -148,7 +150,7 @@ def _sightings(seen: Array, spread: Array, places: list[Array | None], frame: st
     usable &= np.linalg.eigvalsh(np.where(usable[:, None, None], spread, 0.0))[:, 0] > 0
     chosen = [k for k, there in enumerate(places) if there is not None and len(there) and usable[k]]
     if not chosen:
-        raise Unusable("nothing of it is in the map")
+        raise UnusableMessage("nothing of it is in the map")
     return Sightings(flat[chosen], spread[chosen], tuple(places[k] for k in chosen))  # type: ignore[misc]
 
 
@@ -187,13 +189,13 @@ def cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
     return np.column_stack([r * ce * cb, r * ce * sb, r * se]), J @ polar @ J.transpose(0, 2, 1)
 
 
-def _placed(name: str, message: Pose | Odometry, around: Surroundings) -> Placed:
+def _placed(name: str, message: Pose | Odometry, around: LocalizationContext) -> Placed:
     _same_frame(name, "its frame", message.frame, around.map_frame)
     given = message.covariance if isinstance(message, Pose) else message.pose_covariance
     if given is None:
         raise ValueError(f"{name}: its messages have no covariance: how good the positions are must be known")
     if not (np.isfinite(message.position).all() and np.isfinite(message.orientation).all()):
-        raise Unusable("not finite")
+        raise UnusableMessage("not finite")
     T = transform_between(around.extrinsics, message.child_frame or around.base_frame, around.base_frame)
     heading = None
     if 0.0 < given[5, 5] < 1.0:  # else, NaN too, the heading is unknown
@@ -202,9 +204,9 @@ def _placed(name: str, message: Pose | Odometry, around: Surroundings) -> Placed
     return _place(message.position[:2], given[:2, :2], T, heading)
 
 
-def _fix(name: str, fix: NavSatFix, around: Surroundings) -> Placed:
+def _fix(name: str, fix: NavSatFix, around: LocalizationContext) -> Placed:
     if fix.status == "no_fix" or not (math.isfinite(fix.latitude) and math.isfinite(fix.longitude)):
-        raise Unusable("no fix")
+        raise UnusableMessage("no fix")
     if around.origin is None:
         raise ValueError(f"{name}: satellite fixes need `origin`: latitude, longitude, altitude of the map's origin")
     if fix.covariance is None:
@@ -217,7 +219,7 @@ def _fix(name: str, fix: NavSatFix, around: Surroundings) -> Placed:
 
 def _place(place: Array, covariance: Array, T: Array, heading: tuple[float, float] | None) -> Placed:
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
-        raise Unusable("covariance not positive")
+        raise UnusableMessage("covariance not positive")
     return Placed(place, covariance, T[:2, 3], heading)
 
 

@@ -33,7 +33,7 @@ from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.planar import flat, placed_in, planar
 from operators.localization.dead_reckoning import DeadReckoning
-from operators.localization.interpretation import MODALITIES, Surroundings, Unusable, observation
+from operators.localization.interpretation import MODALITIES, LocalizationContext, UnusableMessage, observation
 from operators.localization.likelihood_field import LikelihoodField
 from operators.localization.map_file import read_map
 from operators.localization.motion import DriveNoise
@@ -214,7 +214,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
                 self.state.pending.append((message.stamp, name.partition("/")[2], message))
         if odometry is None or not self._moves(odometry):
             return None
-        around = Surroundings(
+        around = LocalizationContext(
             self.base_frame,
             self.map_frame,
             extrinsics,
@@ -254,7 +254,7 @@ class ParticleFilterLocalizer(Operator, merge=True):
             return False
         return True
 
-    def _advance(self, odometry: Odometry, around: Surroundings) -> None:
+    def _advance(self, odometry: Odometry, around: LocalizationContext) -> None:
         """Moves to an odometry message, with the measurements on the way."""
         if self.start is not None and not self.state.fused.begun:
             for vote in (self.state.fused, *self.state.modalities.values()):
@@ -277,10 +277,10 @@ class ParticleFilterLocalizer(Operator, merge=True):
             for vote in (self.state.fused, *self.state.modalities.values()):
                 vote.move(step * share, covariance * share, self.rng)
 
-    def _observe(self, stamp: int, name: str, message: Message, around: Surroundings) -> None:
+    def _observe(self, stamp: int, name: str, message: Message, around: LocalizationContext) -> None:
         try:
             seen = observation(name, message, around)
-        except Unusable as reason:
+        except UnusableMessage as reason:
             self.state.ignored[f"{name}: {reason}"] += 1
             return
         self.state.fused.update(name, stamp, seen, self.rng)

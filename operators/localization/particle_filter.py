@@ -56,15 +56,15 @@ class CloudConfig:
 
 
 @dataclass(frozen=True)
-class Fit:
+class SensorFit:
     """Fit of the observations of a sensor, [0, 1]: lately (`fast`) and usually (`slow`)."""
 
     fast: float
     slow: float
 
-    def after(self, fit: float) -> Fit:
+    def after(self, fit: float) -> SensorFit:
         fast = self.fast + 0.3 * (fit - self.fast)
-        return Fit(fast, self.slow + (0.05 if fast > self.slow else 0.002) * (fast - self.slow))
+        return SensorFit(fast, self.slow + (0.05 if fast > self.slow else 0.002) * (fast - self.slow))
 
     @property
     def loss(self) -> float:
@@ -77,7 +77,7 @@ class ParticleFilter(Remembered):
 
     poses: Array
     logarithms: Array
-    fits: dict[str, Fit]
+    fits: dict[str, SensorFit]
     injected: int
     _heard: dict[str, int]
 
@@ -118,7 +118,7 @@ class ParticleFilter(Remembered):
         evidence = evidence_of(self.weights, logarithms)
         self.logarithms += logarithms
         weights = self.weights
-        before = self.fits.get(sensor, Fit(self.config.expected, self.config.expected))
+        before = self.fits.get(sensor, SensorFit(self.config.expected, self.config.expected))
         self.fits[sensor] = before.after(float(weights @ fits))
         doubt = self.doubt(trust)
         heard = self._heard[sensor] = self._heard.get(sensor, 0) + 1

@@ -23,7 +23,7 @@ class GridSettings:
 
     `layer` is the height of a slice, as near as whole slices fill the band. `band` holds the heights that matter,
     `growth` (1/m) times the squared range is how far above the band's lower end a surface must lie to be no noisy
-    floor, `near` and `far` bound the ranges; farther rays tell of what they pass.
+    floor, `near` and `far` bound the ranges; farther rays show what they pass.
     """
 
     resolution: float

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedPoints:
     """Points (N, 3) in the frame of the poses, and where the sensor was, (3,). Metres."""
 
     points: Array
@@ -38,7 +38,7 @@ def sensor_pose(frame: str, pose: Pose | Odometry, extrinsics: Transforms | None
     return pose.matrix() @ T_posed_sensor, T_posed_sensor
 
 
-def placed(cloud: PointCloud, pose: Pose | Odometry, extrinsics: Transforms | None) -> Placed | None:
+def placed(cloud: PointCloud, pose: Pose | Odometry, extrinsics: Transforms | None) -> PlacedPoints | None:
     """Returns a cloud in the frame of the pose, deskewed where times and velocity are known; None without a pose.
 
     Raises ValueError where the pose is that of another frame and no transform relates the two.
@@ -52,4 +52,4 @@ def placed(cloud: PointCloud, pose: Pose | Odometry, extrinsics: Transforms | No
         still = np.zeros(3)
         parts = [still if part is None else np.nan_to_num(part) for part in (pose.linear, pose.angular)]
         points = deskewed(points, cloud.time_offsets.astype(np.float64), np.concatenate(parts))
-    return Placed(transform_points(pose.matrix(), points), T[:3, 3])
+    return PlacedPoints(transform_points(pose.matrix(), points), T[:3, 3])

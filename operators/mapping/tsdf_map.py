@@ -63,7 +63,7 @@ class TsdfMap(Operator):
     status: Out[Diagnostics] = Out(doc="observed voxels, and blocks; a warning for an unusable image")
 
     voxel: float = Param(0.03, gt=0.002, doc="side of a voxel", unit="m")
-    truncation: float = Param(3.0, ge=1, doc="voxels before and behind a surface that are told of")
+    truncation: float = Param(3.0, ge=1, doc="voxels before and behind a surface that are updated")
     near: float = Param(0.3, ge=0, doc="nearer depths are left out", unit="m")
     far: float = Param(4.0, gt=0, doc="farther depths are left out", unit="m")
     min_weight: float = Param(

@@ -27,7 +27,7 @@ _PRIOR = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 0.1])  # m, rad, share: stan
 
 
 @dataclass(frozen=True)
-class Misfit:
+class DepthScanErrors:
     """Holds estimated errors of the LiDAR's extrinsic and of the scale of depths, with standard deviations.
 
     `turn` (3,) rad and `shift` (3,) m are what must be put on the LiDAR's points, in the depth camera's axes; `scale`
@@ -88,10 +88,10 @@ class DepthScanAgreement(Remembered):
         self.pairs += 1
         return True
 
-    def misfit(self) -> Misfit:
+    def misfit(self) -> DepthScanErrors:
         """Returns the misfit by the pairs so far."""
         sigmas = np.sqrt(np.diag(np.linalg.inv(self._posterior())))
-        return Misfit(self._x[:3].copy(), self._x[3:6].copy(), float(self._x[6]), sigmas)
+        return DepthScanErrors(self._x[:3].copy(), self._x[3:6].copy(), float(self._x[6]), sigmas)
 
     def _posterior(self) -> Array:
         return self._information + np.diag(1.0 / _PRIOR**2)

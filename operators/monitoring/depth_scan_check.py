@@ -13,7 +13,7 @@ from operators.cloud.deskewing import deskewed
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
-from operators.monitoring.depth_scan import DepthScanAgreement, Misfit
+from operators.monitoring.depth_scan import DepthScanAgreement, DepthScanErrors
 from operators.status import counted_status
 
 _SURE = 4.0  # standard deviations by which a misfit must stand out
@@ -94,7 +94,7 @@ class DepthScanCheck(Operator, tolerance="60ms"):
             "depth_scan_check", stamp, text, Level.WARN if wrong else Level.OK, {**figures, **self.state.counts}
         )
 
-    def _wrong(self, found: Misfit) -> list[str]:
+    def _wrong(self, found: DepthScanErrors) -> list[str]:
         shift, turn, scale = (
             _SURE * float(s) for s in (found.sigmas[:3].max(), found.sigmas[3:6].max(), found.sigmas[6])
         )

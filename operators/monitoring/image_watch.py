@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 from dataflow.messages import DepthImage, Diagnostics, Image, Message
 from dataflow.operator import In, Operator, Out, Param
-from operators.monitoring.watching import Watching
+from operators.monitoring.watching import MeasurementGate
 
 
-class ImageWatch(Watching, Operator):
+class ImageWatch(MeasurementGate, Operator):
     """Passes images on unless they are black or repeat the last one, which the status reports.
 
     A camera that hangs gives its last image with new stamps: what is found in it would be placed where the robot has
@@ -31,7 +31,7 @@ class ImageWatch(Watching, Operator):
         return self.passed(image, image.data, "is black" if black else None)
 
 
-class DepthWatch(Watching, Operator):
+class DepthWatch(MeasurementGate, Operator):
     """Passes depth images on unless they have no returns or repeat the last one, which the status reports."""
 
     named = ("depth_watch", "depth image")

@@ -8,10 +8,10 @@ import numpy as np
 
 from dataflow.messages import Diagnostics, Message, PointCloud
 from dataflow.operator import In, Operator, Out, Param
-from operators.monitoring.watching import Watching
+from operators.monitoring.watching import MeasurementGate
 
 
-class ScanWatch(Watching, Operator):
+class ScanWatch(MeasurementGate, Operator):
     """Passes LiDAR scans on unless they have too few points or repeat the last one, which the status reports.
 
     A LiDAR that hangs looks like a robot that stands: odometry of its scans would hold the pose against all others.

@@ -35,7 +35,7 @@ class State(Counts):
         return found
 
 
-class Watching:
+class MeasurementGate:
     """Makes an operator pass measurements on at a port `checked` unless they have a flaw or repeat the last ones, and
     say so at a port `status`; `named` is its own name and that of what it watches."""
 

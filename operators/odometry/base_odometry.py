@@ -25,7 +25,7 @@ class BaseOdometry(Operator):
     A camera's own odometry begins at its optical frame, tilted as it is mounted. With the extrinsics this gives a frame
     whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite
     gives none, and is counted; so does one without a scale (infinite variances) of a sensor beside the base, since
-    where the base is cannot be told until the scale is known.
+    the position of the base is unknown until the scale is.
 
     Method: covariances to first order, Smith, Self and Cheeseman, "Estimating uncertain spatial relationships in
     robotics", 1990.

@@ -21,7 +21,7 @@ from dataflow.messages import (
 
 @dataclass(frozen=True, slots=True)
 class PerceptionResult:
-    """The messages of one step; None for what the sensors of that step do not tell.
+    """The messages of one step; None for what the sensors of that step do not give.
 
     `stamp` (ns) is that of the step. `cloud` is in the frame of the depth camera or the LiDAR, `boxes` too; `pose`,
     `objects` and `graph` are in the frame in which the robot's base began, z up. `pose` is the newest where several

@@ -18,7 +18,7 @@ class HandedSensors(Source):
     points: Out[PointCloud] = Out(doc="one turn of a LiDAR")
     imu: Out[Imu] = Out(doc="inertial sample")
     wheels: Out[Odometry] = Out(doc="odometry of the wheels, with velocities")
-    command: Out[Twist] = Out(doc="control input: the velocity that the base was told to take")
+    command: Out[Twist] = Out(doc="control input: the commanded velocity of the base")
     image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the image")
     depth_info: Out[CameraInfo] = Out(static=True, doc="calibration of the depth image")
     extrinsics: Out[Transforms] = Out(static=True, doc="where the sensors are on the robot")

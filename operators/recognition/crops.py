@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.network_input import three_channels
 
 Per = Literal["image", "object"]
@@ -36,7 +36,7 @@ class Subjects:
         return views(image, detections)
 
     def summary(self) -> dict[str, int]:
-        """Counts, for an operator's summary; empty where nothing is to be told."""
+        """Counts, for an operator's summary; empty where there is nothing to report."""
         return {"images_without_detections": self.missed} if self.missed else {}
 
 
@@ -61,7 +61,7 @@ def views(image: Image, detections: Detections2D | None) -> tuple[list[NDArray[n
 
 def letterboxed(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Returns the view in the network's input of `size` (width, height), its proportions kept."""
-    return Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), size).apply(pixels)
+    return ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), size).apply(pixels)
 
 
 def covering(pixels: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:

@@ -43,7 +43,7 @@ FLOOR, ROBOT, ROOM = 0, -1, -2
 """Ids of nodes that are not objects."""
 
 AT_ONCE = frozenset({"left_of", "in_front_of"})
-"""Predicates told from where the robot is, which changes as it turns: a mean over time would tell where it looked."""
+"""Predicates judged from where the robot is, which changes as it turns: a mean over time would show where it looked."""
 
 _STEEP = 12.5  # by so much the score of these rises, by the share of the larger difference by which it leads
 

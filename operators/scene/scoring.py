@@ -23,7 +23,7 @@ PREDICATES = ("on", "in", "sitting_on", "holding", "near", "left_of", "in_front_
 """Relations that are scored: those that the simulator's truth has too."""
 
 
-class PlainlySeen:
+class VisibleImages:
     """Counts in how many images each true object was plainly seen: so much of it, with so many pixels."""
 
     def __init__(self, visible: float = 0.6, pixels: int = 200, images: int = 5) -> None:

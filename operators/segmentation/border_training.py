@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.learning.augmentation import Variation, recolored
 from operators.learning.files import TrainingFileError
 from operators.learning.second_stage import Columns, SecondTask, answered
@@ -163,8 +163,8 @@ class BorderTask(SecondTask[MaskedImage, Batch]):
         pixels, preferences, first, second, truth = columns
         return pixels, preferences.float(), first.long(), second.long(), truth.flatten(1)
 
-    def _scores(self, pixels: NDArray[np.uint8]) -> tuple[Fit, NDArray[np.uint8]]:
-        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self._first.size)
+    def _scores(self, pixels: NDArray[np.uint8]) -> tuple[ImageFit, NDArray[np.uint8]]:
+        fit = ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self._first.size)
         return fit, self._first.run(fit.apply(pixels))[0][0]
 
     def _of_image(self, image: MaskedImage, most: int, rng: np.random.Generator) -> Columns:

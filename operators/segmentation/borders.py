@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.weights import Network, SecondNetwork, open_second
 
 KIND = "borders"
@@ -74,7 +74,7 @@ class Borders:
         second = open_second(network, KIND)
         return None if second is None else cls(second)
 
-    def classes(self, scores: Pixels, step: float, pixels: Pixels, fit: Fit) -> Pixels:
+    def classes(self, scores: Pixels, step: float, pixels: Pixels, fit: ImageFit) -> Pixels:
         """The class (H, W) of each pixel of an image (H, W, 3), RGB, by the scores (C, h, w), of so much each, that the
         first network gave for the input into which the image was fitted."""
         return look_again(self._answer, scores, step, pixels, fit)
@@ -91,7 +91,7 @@ class Borders:
 
 
 def look_again(
-    answer: Callable[[Blocks], NDArray[np.float32]], scores: Pixels, step: float, pixels: Pixels, fit: Fit
+    answer: Callable[[Blocks], NDArray[np.float32]], scores: Pixels, step: float, pixels: Pixels, fit: ImageFit
 ) -> Pixels:
     """`Borders.classes`, by what `answer` gives for blocks: (N, 16), above 0 where a pixel is of the first class."""
     shown, placed = worked(pixels, fit)
@@ -108,14 +108,14 @@ def look_again(
 
 
 @dataclass(frozen=True)
-class Placed:
+class PixelMapping:
     """Places pixels among the cells: pixel x of the image lies at the cell x * scale + offset, along both axes."""
 
     scale: tuple[float, float]
     offset: tuple[float, float]
 
 
-def worked(pixels: Pixels, fit: Fit) -> tuple[Pixels, Placed]:
+def worked(pixels: Pixels, fit: ImageFit) -> tuple[Pixels, PixelMapping]:
     """The image as it is gone through, and where its pixels lie among the cells."""
     limit = (round(_FINEST * fit.inner[0]), round(_FINEST * fit.inner[1]))
     if fit.image[0] > limit[0]:
@@ -124,7 +124,7 @@ def worked(pixels: Pixels, fit: Fit) -> tuple[Pixels, Placed]:
     scale = [inner / extent / 2 for inner, extent in zip(fit.inner, size, strict=True)]
     # Pixel 2i of the input has the scores of cell i; pixels are counted from their middle.
     offset = [share / 2 + before / 2 - 0.25 for share, before in zip(scale, fit.offset, strict=True)]
-    return pixels, Placed((scale[0], scale[1]), (offset[0], offset[1]))
+    return pixels, PixelMapping((scale[0], scale[1]), (offset[0], offset[1]))
 
 
 def best_cells(scores: Pixels) -> tuple[Pixels, Pixels]:
@@ -138,7 +138,7 @@ def best_cells(scores: Pixels) -> tuple[Pixels, Pixels]:
 
 
 def found_blocks(
-    scores: Pixels, step: float, labels: Pixels, best: Pixels, pixels: Pixels, placed: Placed
+    scores: Pixels, step: float, labels: Pixels, best: Pixels, pixels: Pixels, placed: PixelMapping
 ) -> tuple[Pixels, Blocks]:
     """The class of the nearest cell for each pixel, up to the end of the last block, and the blocks to look at."""
     height, width = pixels.shape[:2]
@@ -194,7 +194,7 @@ def _others(
     return found
 
 
-def _spread(scores: Pixels, placed: Placed, columns: int, rows: int) -> Pixels:
+def _spread(scores: Pixels, placed: PixelMapping, columns: int, rows: int) -> Pixels:
     """Scores (K, h, w) at every `GRAIN` pixels of the image, beginning `AROUND` pixels before it."""
     size = ((columns * BLOCK + 2 * AROUND) // GRAIN, (rows * BLOCK + 2 * AROUND) // GRAIN)
     first = [

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.inference import ModelError
 
 VOID = 255
@@ -56,7 +56,7 @@ def labelled(
     )
 
 
-def enlarged(values: NDArray[Any], fit: Fit, interpolation: int) -> NDArray[Any]:
+def enlarged(values: NDArray[Any], fit: ImageFit, interpolation: int) -> NDArray[Any]:
     """Returns the part (H, W) or (H, W, C) of the network's input that the image takes, at the image's size."""
     (x, y), (width, height) = fit.offset, fit.inner
     part = np.ascontiguousarray(values[y : y + height, x : x + width])

@@ -12,7 +12,7 @@ from dataflow.messages import Diagnostics, Image, SegmentationMap
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.coco import names_of
-from operators.image.letterbox import Fit, FitMode
+from operators.image.letterbox import FitMode, ImageFit
 from operators.inference import ModelError, Provider, open_session
 from operators.model_metadata import told
 from operators.models.use import use_model
@@ -47,7 +47,7 @@ def classes_of(output: NDArray[Any]) -> NDArray[np.int64]:
     return output.reshape(extents).astype(np.int64)
 
 
-def at_image(values: NDArray[Any], fit: Fit, interpolation: int) -> NDArray[Any]:
+def at_image(values: NDArray[Any], fit: ImageFit, interpolation: int) -> NDArray[Any]:
     """Returns the plane (H, W) of a network's output at the size of the image, without what was only padding.
 
     The plane covers the input, in whatever resolution.
@@ -156,7 +156,7 @@ class OnnxSegmenter(Operator):
 
     def process(self, image: Image) -> dict[str, Any]:
         """Raises ModelError where the model's output is no scores and no map of classes, or has other classes."""
-        fit = Fit.plan(self._fit, (image.width, image.height), self._input.size)
+        fit = ImageFit.plan(self._fit, (image.width, image.height), self._input.size)
         tensor = self._input.tensor(fit.apply(three_channels(image.data)))
         output = np.asarray(self._session.run([self._output], {self._input.name: tensor})[0])
         try:
@@ -180,7 +180,7 @@ class OnnxSegmenter(Operator):
         return messages
 
     def _scored(
-        self, output: NDArray[Any], fit: Fit
+        self, output: NDArray[Any], fit: ImageFit
     ) -> tuple[NDArray[np.intp], NDArray[np.float32] | None, tuple[str, ...]]:
         shares = self._shares
         scores = scores_of(output, None if self._labels is None else len(self._labels.names), shares)
@@ -197,7 +197,7 @@ class OnnxSegmenter(Operator):
         where = f"{type(self).__name__}.class_thresholds"
         return least_of(names, self.confidence_threshold, self.class_thresholds, where)
 
-    def _mapped(self, output: NDArray[Any], fit: Fit) -> tuple[NDArray[np.intp], None, tuple[str, ...]]:
+    def _mapped(self, output: NDArray[Any], fit: ImageFit) -> tuple[NDArray[np.intp], None, tuple[str, ...]]:
         classes = at_image(classes_of(output).astype(np.int32), fit, cv2.INTER_NEAREST)
         names = () if self._labels is None else self._labels.names
         known = classes[classes != 255] if names and len(names) <= 255 else classes

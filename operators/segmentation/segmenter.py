@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.network_input import three_channels
 from operators.segmentation.borders import Borders, scored
 from operators.segmentation.labelled import VOID, enlarged, labelled, least_of
@@ -58,7 +58,7 @@ class Segmenter(Operator):
 
     def process(self, image: Image) -> SegmentationMap:
         network, pixels = self._network, three_channels(image.data)
-        fit = Fit.plan("letterbox", (image.width, image.height), network.size)
+        fit = ImageFit.plan("letterbox", (image.width, image.height), network.size)
         found = network.run(fit.apply(pixels))
         wanted = self.with_confidence or self.confidence_threshold > 0 or bool(self.class_thresholds)
         classes, confidence = self._answered(found, pixels, fit, wanted)
@@ -76,7 +76,7 @@ class Segmenter(Operator):
         return least_of(self._network.classes, self.confidence_threshold, self.class_thresholds, where)
 
     def _answered(
-        self, found: Sequence[NDArray[Any]], pixels: NDArray[np.uint8], fit: Fit, wanted: bool
+        self, found: Sequence[NDArray[Any]], pixels: NDArray[np.uint8], fit: ImageFit, wanted: bool
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
         """Classes (H, W) of the image's pixels and, where wanted, their probability in the network's input."""
         if not self._scored:

@@ -39,7 +39,7 @@ class Mover(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
+class Stationary:
     """Stays where it is."""
 
     T_world_thing: Array
@@ -62,7 +62,7 @@ class Thing:
 
     @property
     def still(self) -> bool:
-        return isinstance(self.mover, Still)
+        return isinstance(self.mover, Stationary)
 
     def vertices(self, t: float) -> Array:
         """(V, 3) in the world, part after part."""
@@ -116,7 +116,7 @@ class Relation:
 
 
 @dataclass(frozen=True)
-class Doing:
+class CurrentActivity:
     """Occupation of a mover: an activity, on which object (-1 for none), since when (s), and the goal it was given."""
 
     thing: int
@@ -173,7 +173,7 @@ def _dense(line: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Order:
+class WorldOptions:
     """Holds what is asked of a world.
 
     `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, how many `people` are
@@ -214,7 +214,7 @@ class World:
     landmarks: NDArray[np.float64]
     camera_mount: Mount
     placements: tuple[Placement, ...]
-    scripts: tuple[Callable[[float], Doing], ...] = ()
+    scripts: tuple[Callable[[float], CurrentActivity], ...] = ()
     floor_id: int = 0
     lanes: tuple[Lane, ...] = ()
     daylight: float = 0.3
@@ -226,7 +226,7 @@ class World:
         """The relations of placement and contact that hold at a time."""
         return [p.relation for p in self.placements if p.holds is None or p.holds(t)]
 
-    def doings(self, t: float) -> list[Doing]:
+    def doings(self, t: float) -> list[CurrentActivity]:
         """Returns what every mover does at a time."""
         return [script(t) for script in self.scripts]
 
@@ -248,13 +248,13 @@ class Builder:
 
     things: list[Thing] = field(default_factory=list)
     placements: list[Placement] = field(default_factory=list)
-    scripts: list[Callable[[float], Doing]] = field(default_factory=list)
+    scripts: list[Callable[[float], CurrentActivity]] = field(default_factory=list)
     lanes: list[Lane] = field(default_factory=list)
     _next: int = 1
 
     def surface(self, label: str, shape: Shape) -> None:
         """A piece of the building, given in world coordinates."""
-        self.things.append(Thing(0, label, (shape,), Still(np.eye(4))))
+        self.things.append(Thing(0, label, (shape,), Stationary(np.eye(4))))
 
     def world(
         self, name: str, lights: Sequence[Light], ambient: float, path: Trajectory, landmarks: Array, mount: Mount,
@@ -273,7 +273,7 @@ class Builder:
     def put(self, label: str, shape: Shape, T: Array, *, on: int | None = None, inside: int | None = None) -> int:
         """Places a still thing, on or in another one; returns its id."""
         id = self.new_id()
-        self.things.append(Thing(id, label, (shape,), Still(T)))
+        self.things.append(Thing(id, label, (shape,), Stationary(T)))
         if on is not None:
             self.relate(id, "on", on)
         if inside is not None:

@@ -13,7 +13,7 @@ from dataflow.messages.geometry import matrix_to_quaternion
 from operators.geometry.se3 import Matrix, about_fixed_axes
 from operators.slam.place import Place
 from operators.slam.place_graph import PlaceGraph
-from operators.slam.sensor_model import Added
+from operators.slam.sensor_model import KeyframeResult
 
 LEVELS = {Place.MAPPED: Level.OK, Place.CORRECTED: Level.OK, Place.SEARCHING: Level.WARN, Place.ADRIFT: Level.WARN}
 
@@ -59,7 +59,7 @@ def map_poses(graph: PlaceGraph[Any]) -> list[tuple[int, Matrix]]:
     return [(node.stamp, node.T) for node in graph.nodes.values() if node.island in graph.tied]
 
 
-def map_due(graph: PlaceGraph[Any], added: Added, period: int) -> bool:
+def map_due(graph: PlaceGraph[Any], added: KeyframeResult, period: int) -> bool:
     """Returns whether the map is sent after what was just added: at every loop and every `period` keyframes."""
     return graph.located and (added.loops > 0 or (added.node and len(graph.nodes) % period == 0))
 

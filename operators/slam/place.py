@@ -9,7 +9,7 @@ from typing import Any
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import Status
 from operators.slam.place_graph import PlaceGraph
-from operators.slam.sensor_model import Added
+from operators.slam.sensor_model import KeyframeResult
 
 
 class Place(StrEnum):
@@ -22,26 +22,32 @@ class Place(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
+class MappingResult:
     """Holds what a frame or scan gave to the map. `T_map_odom` is None while the place in the map is not known."""
 
     place: Place
     reason: str
     T_map_odom: Matrix | None
     covariance: Matrix  # (6, 6) of the sensor's pose in the map, right perturbation
-    added: Added
+    added: KeyframeResult
 
 
 def mapped(
-    graph: PlaceGraph[Any], added: Added, odometry: Status, reason: str, T: Matrix, covariance: Matrix, known: bool
-) -> Mapped:
+    graph: PlaceGraph[Any],
+    added: KeyframeResult,
+    odometry: Status,
+    reason: str,
+    T: Matrix,
+    covariance: Matrix,
+    known: bool,
+) -> MappingResult:
     """Returns what an odometry's pose (4, 4) and its covariance (6, 6) mean in the map, if that is `known`."""
     place, why = _place_of(graph, added, odometry, reason)
     T_map_odom = graph.T_map_odom.copy() if known else None
-    return Mapped(place, why, T_map_odom, graph.covariance_at(T, covariance), added)
+    return MappingResult(place, why, T_map_odom, graph.covariance_at(T, covariance), added)
 
 
-def _place_of(graph: PlaceGraph[Any], added: Added, odometry: Status, reason: str) -> tuple[Place, str]:
+def _place_of(graph: PlaceGraph[Any], added: KeyframeResult, odometry: Status, reason: str) -> tuple[Place, str]:
     refused = f"; refused: {', '.join(added.refused)}" if added.refused else ""
     if added.found:
         return Place.CORRECTED, "the map is found"

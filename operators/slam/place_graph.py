@@ -13,7 +13,17 @@ from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
-from operators.slam.sensor_model import Added, Eyes, Index, Moved, PlaceSettings, Sighting, Surprise, V, alike
+from operators.slam.sensor_model import (
+    Eyes,
+    Index,
+    KeyframeResult,
+    Moved,
+    PlaceSettings,
+    Sighting,
+    UnexpectedView,
+    V,
+    alike,
+)
 
 UNKNOWN = np.diag([1.0] * 3 + [1.0] * 3)  # covariance (6, 6) of a motion that nothing measured, m² and rad²
 WINDOW = 10  # newest keyframes, which are settled at every new one
@@ -33,7 +43,7 @@ class PlaceGraph(Remembered, Generic[V]):
     tied: set[int]  # islands whose place in the map is known
     islands: int  # begun so far
     segments: dict[int, int]  # the odometry's segments' islands
-    surprises: list[Surprise]
+    surprises: list[UnexpectedView]
     loops: int
 
     def __init__(self, settings: PlaceSettings, index: Callable[[], Index[V]], moved: Moved) -> None:
@@ -75,7 +85,7 @@ class PlaceGraph(Remembered, Generic[V]):
     def grow(
         self, stamp: int, T_odom: Matrix, covariance_odom: Matrix, segment: int, jumped: bool,
         eyes: Eyes[V], view: Callable[[], V],
-    ) -> Added:  # fmt: skip
+    ) -> KeyframeResult:  # fmt: skip
         """Takes a pose of the odometry, and its view if it becomes a keyframe.
 
         `segment` is a number for all that one map of the odometry holds; `jumped`: the odometry has found its own map
@@ -88,7 +98,7 @@ class PlaceGraph(Remembered, Generic[V]):
         if last is not None and not broken:
             moved = eyes.distance(last.T_odom, T_odom)
             if moved < self._settings.spacing * (1.0 if self.located else 0.5):
-                return Added()
+                return KeyframeResult()
         before = self.graph.newest if last is not None else None
         new = Node(
             stamp=stamp, T_odom=T_odom, covariance_odom=covariance_odom, T=self.T_map_odom @ T_odom,
@@ -99,7 +109,7 @@ class PlaceGraph(Remembered, Generic[V]):
         number, seen = self.graph.add(new), new.view
         if before is not None:
             self._chain(before, number, broken, eyes)
-        added = Added(node=True)
+        added = KeyframeResult(node=True)
         self._look(number, eyes, added)
         if not added.loops and self._beside(number, eyes):
             self.graph.settle(WINDOW)
@@ -173,7 +183,7 @@ class PlaceGraph(Remembered, Generic[V]):
 
     # -- loops -------------------------------------------------------------------------------------------
 
-    def _look(self, number: int, eyes: Eyes[V], added: Added) -> None:
+    def _look(self, number: int, eyes: Eyes[V], added: KeyframeResult) -> None:
         """Compares a new node with views that it may see again, and corrects the map by those that it does."""
         new = self.nodes[number]
         loops: list[tuple[int, Sighting]] = []
@@ -191,7 +201,7 @@ class PlaceGraph(Remembered, Generic[V]):
             new.view = None
 
     def _recognised(
-        self, number: int, candidates: Sequence[int], eyes: Eyes[V], added: Added
+        self, number: int, candidates: Sequence[int], eyes: Eyes[V], added: KeyframeResult
     ) -> list[tuple[int, Sighting]]:
         """Returns loops to views that look alike, of which the first that is believed will do."""
         for k in candidates:
@@ -236,7 +246,7 @@ class PlaceGraph(Remembered, Generic[V]):
         ]
 
     def _sights(
-        self, number: int, candidates: Sequence[int], eyes: Eyes[V], expected: bool, added: Added
+        self, number: int, candidates: Sequence[int], eyes: Eyes[V], expected: bool, added: KeyframeResult
     ) -> list[tuple[int, Sighting]]:
         """Returns those of the candidates that are seen again; notes why the others are not."""
         found: list[tuple[int, Sighting]] = []
@@ -273,7 +283,7 @@ class PlaceGraph(Remembered, Generic[V]):
         known, new = self.nodes[k], self.nodes[number]
         T_map_odom = known.T @ seen.T_known_seen @ invert(new.T_odom)
         agreeing = any(s.agrees(k, number, new, T_map_odom) for s in self.surprises)
-        self.surprises = [*self.surprises[-9:], Surprise(number, k, new.island, T_map_odom)]
+        self.surprises = [*self.surprises[-9:], UnexpectedView(number, k, new.island, T_map_odom)]
         return agreeing
 
     def _close(self, number: int, loops: Sequence[tuple[int, Sighting]]) -> bool:

@@ -72,7 +72,7 @@ class Index(Protocol[W]):
 
 
 @dataclass(frozen=True, eq=False)
-class Surprise:
+class UnexpectedView:
     """A sight that the map did not expect, of node `known` by node `seen`; it needs another that agrees."""
 
     seen: int
@@ -94,7 +94,7 @@ def alike(T_a: Matrix, T_b: Matrix) -> bool:
 
 
 @dataclass(eq=False)
-class Added:
+class KeyframeResult:
     """Holds the result for a keyframe: loops found from it, and why views that were compared with were refused."""
 
     node: bool = False

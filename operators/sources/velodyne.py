@@ -31,7 +31,7 @@ class _Velodyne(Source, abstract=True):
 
     frame: str = Param("velodyne", min_length=1, doc="frame of the sensor")
     model: Literal["", "HDL32E", "PuckHiRes", "VLP16", "VLP32A", "VLP32B", "VLP32C", "VLS128"] = Param(
-        "", doc="model; empty takes that in the packets, which a Puck Hi-Res and some of the VLP-32 do not tell apart"
+        "", doc="model; empty takes that in the packets, which are the same for a Puck Hi-Res and some of the VLP-32"
     )
     min_range: float = Param(0.1, ge=0, unit="m", doc="nearer points are left out")
     max_range: float = Param(200.0, gt=0, unit="m", doc="farther points are left out")

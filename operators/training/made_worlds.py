@@ -14,7 +14,7 @@ Chosen = tuple[str, int, int]
 """Kind, seed and number of people of a world."""
 
 
-class Writable(Protocol):
+class StorableResult(Protocol):
     """Result of a world, which a file can keep."""
 
     def write(self, file: Path) -> None: ...
@@ -32,7 +32,7 @@ def file_of(folder: Path, world: Chosen) -> Path:
 
 
 def write_lacking(
-    folder: Path, chosen: Sequence[Chosen], processes: int, make: Callable[[str, int, int], Writable]
+    folder: Path, chosen: Sequence[Chosen], processes: int, make: Callable[[str, int, int], StorableResult]
 ) -> Iterator[int]:
     """Writes what `make` gives of each world that the folder lacks; yields how many are made after each.
 
@@ -47,7 +47,7 @@ def write_lacking(
             yield k + 1
 
 
-def _write(folder: Path, make: Callable[[str, int, int], Writable], world: Chosen) -> None:
+def _write(folder: Path, make: Callable[[str, int, int], StorableResult], world: Chosen) -> None:
     file = file_of(folder, world)
     unfinished = file.with_suffix(".partial.npz")
     make(*world).write(unfinished)

@@ -33,7 +33,7 @@ BorderEpochs = Annotated[
 ]
 
 
-class Second(ABC):
+class SecondStage(ABC):
     """A kind of second network, with the passes, chunks of a step and largest learning rate that suit it."""
 
     kind: ClassVar[str]
@@ -56,7 +56,7 @@ class Second(ABC):
         return True
 
 
-class Refiner(Second):
+class Refiner(SecondStage):
     """Moves the sides of a detector's boxes."""
 
     kind, first = "refiner", "detector"
@@ -82,7 +82,7 @@ class Refiner(Second):
         return RefinerTask(data, first, seed=seed, variation=variation)
 
 
-class Borders(Second):
+class Borders(SecondStage):
     """Decides again where classes meet."""
 
     kind, first = "borders", "segmenter"
@@ -116,7 +116,7 @@ class Borders(Second):
 REFINER, BORDERS = Refiner(), Borders()
 
 
-def train_second(second: Second, data: Any, first: Path, options: ImageTraining, epochs: int) -> Outcome | None:
+def train_second(second: SecondStage, data: Any, first: Path, options: ImageTraining, epochs: int) -> Outcome | None:
     """The last step of a first network's training: its second one, by so many passes; None without any."""
     if epochs == 0 or not second.suits(data):
         return None
@@ -144,7 +144,7 @@ def add_second(task: Task, first: Path, out: Path, options: ImageTraining) -> Ou
     return outcome
 
 
-def command_of(second: Second) -> Callable[..., None]:
+def command_of(second: SecondStage) -> Callable[..., None]:
     """Makes the command that trains second networks of a kind alone."""
 
     @takes(ImageTraining, epochs=second.epochs, batch=second.batch, learning_rate=second.learning_rate)

@@ -77,7 +77,7 @@ def train_torchvision(
 
 
 def _shown(read: Read, files: list[Path], size: str | None, options: ImageTraining) -> tuple[int, int]:
-    """The size of training images, after what was read is told."""
+    """The size of training images, after what was read is reported."""
     shown = input_size(size, files[:20])
     tell_data(read, shown, options.json)
     return shown

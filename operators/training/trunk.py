@@ -1,7 +1,7 @@
 """One trunk for two networks in 8 bits that were trained together: what both compute alike, with the same ranges.
 
 Each was quantized by itself: weights that were equal are equal still, but ranges were measured apart, so that the
-trunks give other bits. The second network takes over the first one's, and both files tell where it ends.
+trunks give other bits. The second network takes over the first one's, and both files hold where it ends.
 """
 
 from __future__ import annotations

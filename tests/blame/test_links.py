@@ -7,7 +7,7 @@ import pytest
 
 from dataflow.blame.field import change, differ
 from dataflow.blame.line import Call
-from dataflow.blame.links import Chain, Effect, Link, Untried, Way
+from dataflow.blame.links import Chain, Effect, Link, UntestedInput, Way
 from dataflow.blame.nudge import SIZE, nudged
 from dataflow.messages import FeatureVector, Image
 
@@ -89,10 +89,10 @@ def test_calls_beside_each_other_that_could_not_be_tried_are_noted_together() ->
     found.was_raised(Call("track", 3), 3, "", "another operator")
 
     assert found.untried == [
-        Untried(Call("map", 4), 6, "", "second"),
-        Untried(Call("map", 1), 2, "", "third"),
-        Untried(Call("map", 4), 4, "x", "an input"),
-        Untried(Call("track", 3), 3, "", "another operator"),
+        UntestedInput(Call("map", 4), 6, "", "second"),
+        UntestedInput(Call("map", 1), 2, "", "third"),
+        UntestedInput(Call("map", 4), 4, "x", "an input"),
+        UntestedInput(Call("track", 3), 3, "", "another operator"),
     ]
 
 

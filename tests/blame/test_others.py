@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from dataflow.blame.again import Slot
-from dataflow.blame.others import without
+from dataflow.blame.repeated_calls import Slot
+from dataflow.blame.substitutes import without
 from dataflow.messages import FeatureVector
 from dataflow.operator import Batch, In, Operator, Sampled
 from dataflow.sync import Entry, Firing, InputValue

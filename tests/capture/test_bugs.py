@@ -8,11 +8,11 @@ import pytest
 import seeded_bugs
 from zoo import bugs
 
-from dataflow.capture.capture import Found
+from dataflow.capture.capture import CaptureResult
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Found, int, Path]]:
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[CaptureResult, int, Path]]:
     folder = tmp_path_factory.mktemp("bugs")
     made = {}
     for case in bugs.CASES:
@@ -25,7 +25,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Found, in
 
 
 @pytest.mark.long
-def test_every_bug_is_captured_small(found: dict[str, tuple[Found, int, Path]]) -> None:
+def test_every_bug_is_captured_small(found: dict[str, tuple[CaptureResult, int, Path]]) -> None:
     assert len(found) == 10
     for name, (one, nbytes, _) in found.items():
         assert one.calls > 40, name
@@ -35,7 +35,7 @@ def test_every_bug_is_captured_small(found: dict[str, tuple[Found, int, Path]]) 
 
 
 @pytest.mark.long
-def test_the_tests_fail_alone_and_pass_on_mended_code(found: dict[str, tuple[Found, int, Path]]) -> None:
+def test_the_tests_fail_alone_and_pass_on_mended_code(found: dict[str, tuple[CaptureResult, int, Path]]) -> None:
     tests = [test for _, _, test in found.values()]
 
     assert seeded_bugs.outcomes(tests, fixed=False) == {test.stem: False for test in tests}

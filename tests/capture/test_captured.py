@@ -16,7 +16,7 @@ from zoo import bugs, tuned
 
 import dataflow
 from dataflow.capture.capture import capture, write_test
-from dataflow.capture.captured import Captured, Change
+from dataflow.capture.captured import CapturedCalls, Change
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import DebugError, Debugger
 from dataflow.execution.snapshots import pack_state, unpack_state
@@ -42,21 +42,21 @@ def _made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dataflow.capture.capture.check_repeats", lambda made: None)
 
 
-def captured(path: Path, operator: str = "bug", number: int | None = None, predicate: str = "") -> Captured:
+def captured(path: Path, operator: str = "bug", number: int | None = None, predicate: str = "") -> CapturedCalls:
     with Recording(path) as recording:
         return capture(recording, Debugger(recording, operator), number, predicate).captured
 
 
 def test_captured_call_survives_its_file(late: Path) -> None:
     made = captured(late)
-    read = Captured.from_bytes(made.to_bytes())
+    read = CapturedCalls.from_bytes(made.to_bytes())
 
     assert (read.setting, read.state, read.predicate) == (made.setting, made.state, made.predicate)
     assert [shot.firing for shot in read.shots] == [shot.firing for shot in made.shots]
     with pytest.raises(AssertionError, match=r"bug: out\.vectors: .* \(expected against made\)"):
         read.check()
     with pytest.raises(ValueError, match="no captured call"):
-        Captured.from_bytes(b"something else")
+        CapturedCalls.from_bytes(b"something else")
 
 
 def test_capturing_a_call_without_error_is_refused(late: Path) -> None:
@@ -99,7 +99,7 @@ def test_answers_of_a_service_are_in_the_test(tmp_path: Path) -> None:
 
     made = captured(tmp_path / "run.mcap", "describe", predicate="'nothing' not in out.text.text")
 
-    outcome = Captured.from_bytes(made.to_bytes()).play()
+    outcome = CapturedCalls.from_bytes(made.to_bytes()).play()
     assert outcome.error is None
     assert re.search(r" at 0\.\d+", outcome.outputs["text"].text)
 
@@ -124,7 +124,7 @@ def test_a_parameter_is_changed_where_it_was(changed: Path, monkeypatch: pytest.
 
     changes = [(shot.firing.inputs["x"].value.vectors[0, 0], shot.changes) for shot in made.shots if shot.changes]
     assert [(k, change.name, change.value) for k, [change] in changes] == [(tuned.CHANGED, "factor", 3.0)]
-    read = Captured.from_bytes(made.to_bytes())
+    read = CapturedCalls.from_bytes(made.to_bytes())
     with pytest.raises(AssertionError, match=r"tuned: out\.vectors"):
         read.check()
     monkeypatch.setenv("ZOO_FIXED", "1")
@@ -145,7 +145,7 @@ def test_a_reset_is_made_where_it_was(changed: Path) -> None:
 
     again = replace(made, shots=(*earlier, last._replace(changes=(reset,))))
 
-    read = Captured.from_bytes(again.to_bytes())
+    read = CapturedCalls.from_bytes(again.to_bytes())
     assert read.shots[-1].changes == (reset,)
     outcome = replace(read, shots=(*read.shots[:-1], read.shots[-1]._replace(firing=earlier[-1].firing))).play()
     assert outcome.outputs["out"].vectors[0, 0] == 3.0 * (tuned.WRONG - 1)

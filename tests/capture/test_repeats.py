@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import dataflow
 from dataflow.capture.capture import capture
-from dataflow.capture.captured import Captured
+from dataflow.capture.captured import CapturedCalls
 from dataflow.capture.repeats import NotRepeated, check_repeats
 from dataflow.cli.main import app
 from dataflow.debugging.debugger import DebugError, Debugger
@@ -31,7 +31,7 @@ def recorded(use: str, path: Path) -> Path:
     return path
 
 
-def captured(path: Path, predicate: str = "") -> Captured:
+def captured(path: Path, predicate: str = "") -> CapturedCalls:
     with Recording(path) as recording:
         return capture(recording, Debugger(recording, "op"), None, predicate).captured
 

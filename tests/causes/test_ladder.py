@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from dataflow.causes.ladder import MOST, Findings, Ladder
-from dataflow.causes.rerun import Rerun, Setting
+from dataflow.causes.ladder import MOST, Findings, InterventionSearch
+from dataflow.causes.rerun import Rerun, RerunSettings
 from dataflow.causes.sources import (
     ADDRESSES,
     CHANCE,
@@ -50,9 +50,9 @@ class Operator:
     causes: Collection[str]
     reads: Collection[str] = ()
     differs: bool = False
-    settings: list[Setting] = field(default_factory=list)
+    settings: list[RerunSettings] = field(default_factory=list)
 
-    def fire(self, setting: Setting) -> Rerun:
+    def fire(self, setting: RerunSettings) -> Rerun:
         self.settings.append(setting)
         chance = [s for s in self.causes if s in CHANCE and s not in setting.fixed]
         run = len(self.settings) if self.differs or (chance and not setting.varied) else 0
@@ -66,13 +66,13 @@ class Operator:
 class Repeating(Operator):
     """Repeats, and depends on what no recording holds."""
 
-    def fire(self, setting: Setting) -> Rerun:
+    def fire(self, setting: RerunSettings) -> Rerun:
         found, moved = Operator.fire(self, setting), setting.varied.intersection(self.causes)
         return Rerun((str(sorted(moved)),), sites=found.sites, given=moved)
 
 
 def climbed(operator: Operator, repeats: bool | None = False, left_out: tuple[str, ...] = ()) -> Findings:
-    found = Ladder(operator.fire, left_out).climb(repeats)
+    found = InterventionSearch(operator.fire, left_out).climb(repeats)
     assert found.reruns == len(operator.settings) <= MOST
     return found
 
@@ -113,7 +113,7 @@ def test_a_source_that_compiled_code_asks_is_tried_though_no_log_shows_it(cause:
     """`sorted(things, key=id)` calls `id` past the interpreter."""
     operator = Operator({cause})
 
-    found = Ladder(lambda setting: replace(operator.fire(setting), sites=())).climb(repeats=False)
+    found = InterventionSearch(lambda setting: replace(operator.fire(setting), sites=())).climb(repeats=False)
 
     assert found.causes == [cause]
     assert found.reruns <= MOST
@@ -155,7 +155,7 @@ def test_cause_with_agreeing_runs_is_found_beside_other_causes(cause: str) -> No
     """The difference of two readings of a clock, rounded to 10 ms, is 0 in two quiet runs."""
     operator = Repeating({cause, ENTROPY, HEAP}, reads={WALL, GAIN})
 
-    found = Ladder(lambda setting: replace(operator.fire(setting), sites=())).climb(repeats=True)
+    found = InterventionSearch(lambda setting: replace(operator.fire(setting), sites=())).climb(repeats=True)
 
     assert set(found.causes) == {cause, ENTROPY, HEAP}
     assert found.reruns <= MOST
@@ -173,11 +173,11 @@ def test_a_source_that_is_left_free_is_changed_as_well_since_real_runs_may_agree
 def test_threads_that_repeat_among_themselves_are_no_cause() -> None:
     """Sums of four threads may differ from those of one, and be the same each time."""
 
-    def fire(setting: Setting) -> Rerun:
+    def fire(setting: RerunSettings) -> Rerun:
         made = (f"{THREADS in setting.fixed} {0 if UUID in setting.fixed else object()}",)
         return Rerun(made, sites=((UUID, SITE, 1),), threads=4)
 
-    found = Ladder(fire).climb(repeats=False)
+    found = InterventionSearch(fire).climb(repeats=False)
 
     assert found.causes == [UUID]
 
@@ -185,9 +185,9 @@ def test_threads_that_repeat_among_themselves_are_no_cause() -> None:
 def test_process_death_by_an_unfixed_source_reveals_the_cause() -> None:
     operator = Operator(())
 
-    def fire(setting: Setting) -> Rerun:
+    def fire(setting: RerunSettings) -> Rerun:
         if setting.fixed and HEAP not in setting.fixed:
             raise RunFailed("operator 'x' was killed by SIGSEGV")
         return operator.fire(setting)
 
-    assert Ladder(fire).climb(repeats=False).causes == [HEAP]
+    assert InterventionSearch(fire).climb(repeats=False).causes == [HEAP]

@@ -19,7 +19,7 @@ from dataflow.api.runs import run
 from dataflow.causes.ladder import Findings
 from dataflow.causes.rerun import Rerun, fake_time
 from dataflow.causes.traps import Site
-from dataflow.causes.why import Cause, Why, _Alone, _answer, refusal, why
+from dataflow.causes.why import Cause, CauseReport, _Alone, _answer, refusal, why
 from dataflow.cli.commands.verification import _may_be_a_test
 from dataflow.cli.main import app
 from dataflow.cli.support.causes import print_reasons
@@ -162,7 +162,7 @@ def test_changed_code_is_reported_before_other_dependencies() -> None:
     gain = Cause("environment variable:GAIN", (Site("/robot/op.py", 20, "setup", "os.environ"),), 1)
     console = Console(file=io.StringIO(), width=200)
 
-    print_reasons(console, "", [Why("x", repeats=True, changed=("code of op",), also=(gain,))])
+    print_reasons(console, "", [CauseReport("x", repeats=True, changed=("code of op",), also=(gain,))])
 
     assert console.file.getvalue().splitlines() == [
         "x: it repeats here, and this is not as it was recorded (0 re-runs, 0.00 s)",
@@ -178,14 +178,14 @@ def test_changed_code_is_reported_before_other_dependencies() -> None:
         ({"code_changed": ["op"]}, False, None, False),
         ({}, True, None, False),  # as it was recorded: what differs is not known, and may differ by chance
         ({"code_known": False}, True, None, True),
-        ({}, True, Why("x", repeats=True, causes=(Cause("environment variable:GAIN"),)), True),
-        ({}, True, Why("x", repeats=True, causes=(Cause("monotonic clock"),)), False),
-        ({"code_changed": ["op"]}, True, Why("x", repeats=True, also=(Cause("wall clock"),)), False),
-        ({"code_changed": ["op"]}, True, Why("x", repeats=False, settled=True), False),
+        ({}, True, CauseReport("x", repeats=True, causes=(Cause("environment variable:GAIN"),)), True),
+        ({}, True, CauseReport("x", repeats=True, causes=(Cause("monotonic clock"),)), False),
+        ({"code_changed": ["op"]}, True, CauseReport("x", repeats=True, also=(Cause("wall clock"),)), False),
+        ({"code_changed": ["op"]}, True, CauseReport("x", repeats=False, settled=True), False),
     ],
 )
 def test_a_test_is_advised_of_calls_that_differ_and_not_by_chance(
-    found: dict[str, Any], repeats: bool, reasons: Why | None, advised: bool
+    found: dict[str, Any], repeats: bool, reasons: CauseReport | None, advised: bool
 ) -> None:
     made = report(Verification("x", first=DIFFERENCE, own_fault=True, **{"code_known": True} | found))
     made = replace(made, repeated={"x": repeats})

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.cli.commands.following.reload import _require_same_files, reload
-from dataflow.client.processes import Refused
+from dataflow.client.processes import RequestRejected
 from dataflow.execution.live import SET_UP_WITHIN
 from dataflow.graph.code import digest_of
 
@@ -21,7 +21,9 @@ def test_files_that_differ_from_those_of_the_other_machine_are_named(
     monkeypatch.syspath_prepend(str(tmp_path))
 
     _require_same_files({"edited_here": digest_of(b"GAIN = 2\n"), "only_there": "0" * 64}, "arm")
-    with pytest.raises(Refused, match=r"edited_here on machine 'arm' differs from here: install it there first"):
+    with pytest.raises(
+        RequestRejected, match=r"edited_here on machine 'arm' differs from here: install it there first"
+    ):
         _require_same_files({"edited_here": digest_of(b"GAIN = 1\n")}, "arm")
 
 

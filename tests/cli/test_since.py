@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dataflow.causes.why import Cause, Why
+from dataflow.causes.why import Cause, CauseReport
 from dataflow.cli.commands.verification import _reasons
 from dataflow.cli.support.causes import _lines
 from dataflow.cli.support.verdicts import explain
@@ -62,7 +62,7 @@ def test_report_names_changes_or_none(of: dict[str, Any], more: dict[str, Any], 
 
 
 def test_unchanged_operator_is_reported_as_recorded() -> None:
-    [line] = _lines(Why("x", repeats=True, code_known=True, reruns=4))
+    [line] = _lines(CauseReport("x", repeats=True, code_known=True, reruns=4))
 
     assert (
         "code, parameters, libraries and machine are as recorded: what it reads from outside may have changed" in line
@@ -71,7 +71,7 @@ def test_unchanged_operator_is_reported_as_recorded() -> None:
 
 
 def test_files_that_have_an_effect_and_are_older_than_the_recording_are_named() -> None:
-    lines = list(_lines(Why("x", repeats=True, code_known=True, also=(Cause("file:/etc/gain"),), reruns=4)))
+    lines = list(_lines(CauseReport("x", repeats=True, code_known=True, also=(Cause("file:/etc/gain"),), reruns=4)))
 
     assert lines[1] == "x: its results also depend on file /etc/gain, older than the recording"
 

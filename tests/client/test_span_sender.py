@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from span_collector import collector
 
-from dataflow.client.span_sender import Refused, SpanSender, into_file, to_collector
+from dataflow.client.span_sender import SpanSender, SpansRejected, into_file, to_collector
 
 
 def outcome(write: Callable[[str], int], requests: int = 1, **how: Any) -> tuple[int, int, str]:
@@ -57,7 +57,7 @@ def test_a_file_holds_a_request_a_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_written_refuses() -> None:
-    with pytest.raises(Refused, match="/dev/full: No space left"):
+    with pytest.raises(SpansRejected, match="/dev/full: No space left"):
         into_file(Path("/dev/full"))("{}")
 
 

@@ -17,8 +17,8 @@ import dataflow
 from dataflow.api.local import LocalRun
 from dataflow.capture.capture import capture
 from dataflow.cli.support.debug_shell import Shell, WrongCommand
-from dataflow.debugging.debugger import DebugError, Debugger, Unmade
-from dataflow.debugging.fired import SPACING, Fired, Probe, Process
+from dataflow.debugging.debugger import DebugError, Debugger, UnrepeatableCalls
+from dataflow.debugging.fired import SPACING, Probe, Process, RepeatedCall
 from dataflow.execution.failure import OperatorFailure
 from dataflow.graph import Graph, load_graph, load_text
 from dataflow.graph.sections import Record
@@ -91,7 +91,7 @@ def test_all_calls_are_as_recorded_forwards_and_in_any_order(kept: Recording, op
     debugger.close()
 
 
-def shown(fired: Fired) -> tuple[Any, ...]:
+def shown(fired: RepeatedCall) -> tuple[Any, ...]:
     return fired.call, fired.before, fired.after, [m.here.digest() for m in fired.made if m.here]
 
 
@@ -405,7 +405,7 @@ def torn(added: Recording, tmp_path: Path) -> Iterator[Recording]:
 def test_calls_that_cannot_be_made_are_counted(torn: Recording) -> None:
     debugger = Debugger(torn, "adder")
     assert debugger.first_difference() is None
-    lost = Unmade(len(debugger.calls) - 20, 20, "graph/numbers/x #20 is not recorded")
+    lost = UnrepeatableCalls(len(debugger.calls) - 20, 20, "graph/numbers/x #20 is not recorded")
     assert debugger.unmade == lost
     assert str(lost) == "11 calls could not be made again (the first is call 20: graph/numbers/x #20 is not recorded)"
 
@@ -454,10 +454,10 @@ def test_calls_on_the_way_that_cannot_be_made_are_counted(added: Recording, tmp_
         assert "missing" in debugger.unmade.why
 
 
-def all_made(debugger: Debugger, first: int = 0, last: int | None = None) -> list[Fired]:
-    found = list[Fired]()
+def all_made(debugger: Debugger, first: int = 0, last: int | None = None) -> list[RepeatedCall]:
+    found = list[RepeatedCall]()
 
-    def visit(fired: Fired) -> bool:
+    def visit(fired: RepeatedCall) -> bool:
         found.append(fired)
         return False
 
@@ -485,8 +485,8 @@ def test_search_reports_calls_that_it_could_not_make(
     debugger = Debugger(torn, "adder")
     made = debugger.goto(3)
 
-    def found(condition: Callable[[Fired], bool]) -> Fired:
-        debugger.unmade = Unmade(2, 1, "records before it are missing")
+    def found(condition: Callable[[RepeatedCall], bool]) -> RepeatedCall:
+        debugger.unmade = UnrepeatableCalls(2, 1, "records before it are missing")
         return made
 
     monkeypatch.setattr(debugger, "until", found)

@@ -9,7 +9,15 @@ from pathlib import Path
 from source_trees import nodes_of
 
 PACKAGES = ("execution", "process", "reexecution", "supervision", "verification")
-KINDS = {"LiveRunner", "OperatorRunner", "RecordedRunner", "LogFeed", "NoLoss", "LossTold", "LiveSinkProcess"}
+KINDS = {
+    "LiveRunner",
+    "OperatorRunner",
+    "RecordedRunner",
+    "LogFeed",
+    "LosslessPolicy",
+    "LossReportingPolicy",
+    "LiveSinkProcess",
+}
 """Classes of which one run has this and another that."""
 MAKES = {"__init__", "_outlet", "open", "release", "_make_runner", "_make_source"} | {
     "core_of",

@@ -12,8 +12,8 @@ from held_runs import MS, STAMP
 from dataflow.drops import player as player_module
 from dataflow.drops.branch import Branch, Figures
 from dataflow.drops.losses import Loss, bursts_of
-from dataflow.drops.player import Given, PlayedCalls, Player
-from dataflow.drops.search import Cost, Drops, DropsError, Worse
+from dataflow.drops.player import PlayedCalls, Player, ReplayedFirings
+from dataflow.drops.search import Cost, Drops, DropsError, FailureCondition
 from dataflow.graph import Graph, load_text
 from dataflow.messages import FeatureVector, Message
 from dataflow.recording import Recording
@@ -115,11 +115,14 @@ def test_figure_is_found_by_name_prefix_or_operator() -> None:
 
     texts = ("ate_rmse_m > 0.05", "ate > 0.05", "track.ate_rmse_m > 0.05", "ate_max > 0.2", "rpe_1s == 2", "rpe == 2")
     for text in texts:
-        worse = Worse(text, figures)
+        worse = FailureCondition(text, figures)
         assert worse.operators == ["track"]
         assert worse.is_true(figures)
-    assert Worse("ate > 1 or recall < 1", figures).values(figures) == {"track: ate_rmse_m": 0.1, "other: recall": 0.5}
-    assert not Worse("recall < 0.4", figures).is_true(figures)
+    assert FailureCondition("ate > 1 or recall < 1", figures).values(figures) == {
+        "track: ate_rmse_m": 0.1,
+        "other: recall": 0.5,
+    }
+    assert not FailureCondition("recall < 0.4", figures).is_true(figures)
 
 
 @pytest.mark.parametrize(
@@ -135,12 +138,12 @@ def test_figure_is_found_by_name_prefix_or_operator() -> None:
 def test_an_expression_may_call_functions(text: str, is_true: bool) -> None:
     figures = {"track": {"end_error_m": -1.5, "recall": 0.5, "round_trip_ms": 3.0}}
 
-    assert Worse(text, figures).is_true(figures) == is_true
+    assert FailureCondition(text, figures).is_true(figures) == is_true
 
 
 def test_unknown_functions_are_refused() -> None:
     with pytest.raises(DropsError, match="no function open, sqrt; there are: abs, min, max, round, sum, len, any, all"):
-        Worse("sqrt(recall) > open('x')", {"track": {"recall": 0.5}})
+        FailureCondition("sqrt(recall) > open('x')", {"track": {"recall": 0.5}})
 
 
 @pytest.mark.parametrize(
@@ -218,7 +221,7 @@ def test_stateless_operator_has_recorded_parameters_in_each_replay() -> None:
 
 def test_inputs_before_a_kept_state_are_released(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player_module, "SPACING", 0.0)
-    given = Given()
+    given = ReplayedFirings()
     graph = _graph("Count", "step: drive/step")
     player = Player(graph.nodes["it"], graph, 1, ())
     for stamp in (10, 20, 30):

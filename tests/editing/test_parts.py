@@ -18,7 +18,7 @@ from dataflow.editing.spans import RunRecords, folded, listed
 from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.streams.copying import Origin
-from dataflow.records.cuts import Taken, taken_by
+from dataflow.records.cuts import ResumePoint, taken_by
 from dataflow.records.firing import CALLS, Emission, FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings, whole
 from dataflow.supervision.run import replay
@@ -240,6 +240,6 @@ def test_a_state_that_was_too_large_to_be_kept_stands_in_for_no_calls() -> None:
     assert taken_by(large) is None
     setup, cut = folded(records)
     assert (setup.kind, cut.kind, cut.index) == ("setup", "cut", 2)
-    assert taken_by(cut) == Taken(again=False, at_setup={}, since={}, state=None)
+    assert taken_by(cut) == ResumePoint(again=False, at_setup={}, since={}, state=None)
     part = RunRecords({"op": listed(records)}, {}).of_span((), 2, None, lambda _: (2, None))
     assert part.unknown == ("op",)

@@ -28,7 +28,7 @@ from dataflow.reexecution.recorded_run import ReplayError, graph_that_is_here
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.run import run
 from dataflow.tool_server import proof
-from dataflow.tool_server.jobs import Refused, place_of
+from dataflow.tool_server.jobs import CallFailed, place_of
 from dataflow.tool_server.tools import answer
 from dataflow.verification.complete import complete
 from dataflow.verification.places import env_of_chain
@@ -247,7 +247,7 @@ def test_a_fix_is_proven_by_calls_in_the_environment_of_its_operator(recorded: P
     assert proof["changed_calls"]["count"] == 19  # of 20: 0 times a gain is 0
     assert wrong["reasons"] == ["call 3: expect is false: out.y.vectors[0, 0] == 3 * 7.0"]
     assert "call 3 of first made again; all its calls follow" in said
-    with pytest.raises(Refused, match=r"expect='1 = 2'|no Python expression"):
+    with pytest.raises(CallFailed, match=r"expect='1 = 2'|no Python expression"):
         answer("prove", {**asked, "expect": "1 = 2"}, said.append)
 
 
@@ -264,7 +264,7 @@ def test_other_operator_is_judged_without_its_recorded_code(recorded: Path, monk
 
 
 def test_a_tool_that_would_need_two_environments_is_refused(recorded: Path) -> None:
-    with pytest.raises(Refused, match=r"'second' runs in the environment"):
+    with pytest.raises(CallFailed, match=r"'second' runs in the environment"):
         place_of("blame", {"recording": str(recorded), "field": "second/y.vectors@0.01"})
 
 

@@ -8,7 +8,7 @@ from types import FrameType
 
 from firing_operators import Collector, Echo, entry, node
 
-from dataflow.execution.driver import Driver, HandOver
+from dataflow.execution.driver import Driver, LocalEmitter
 from dataflow.execution.feeds.feeding import Feeding
 from dataflow.execution.runner import OperatorRunner
 from dataflow.operator import Operator
@@ -18,7 +18,7 @@ from dataflow.sync import NEVER
 class Fed:
     """A feed of messages on one stream."""
 
-    def __init__(self, emitter: HandOver, stamps: list[int]) -> None:
+    def __init__(self, emitter: LocalEmitter, stamps: list[int]) -> None:
         self.emitter, self.left = emitter, list(enumerate(stamps))
         self.firings, self.last, self.ended = 0, NEVER, False
 
@@ -43,7 +43,7 @@ def chain(driver: Driver, *names: str) -> None:
     before = "t/in"
     for name in names:
         made = replace(node(Echo, {"x": [before]}), name=name, outputs={"y": f"t/{name}"})
-        driver.add(OperatorRunner(made, HandOver(driver), static=frozenset()))
+        driver.add(OperatorRunner(made, LocalEmitter(driver), static=frozenset()))
         before = f"t/{name}"
     driver.set_up()
 
@@ -61,7 +61,7 @@ def test_a_promise_alone_goes_down_a_chain_of_operators_without_waiting_for_more
     chain(driver, "a", "b", "c")
     drive(driver)
 
-    HandOver(driver).frontier("t/in", 100)
+    LocalEmitter(driver).frontier("t/in", 100)
     drive(driver)
 
     assert [runner.done for runner in driver.operators] == [100, 100, 100]
@@ -70,7 +70,7 @@ def test_a_promise_alone_goes_down_a_chain_of_operators_without_waiting_for_more
 def test_a_step_of_the_feeds_is_worked_through_before_the_next_is_given() -> None:
     given: list[int] = []
 
-    class Noting(HandOver):
+    class Noting(LocalEmitter):
         def message(self, stream: str, entry: object) -> None:
             given.append(sum(runner.firings for runner in driver.operators))
             super().message(stream, entry)
@@ -89,7 +89,7 @@ def test_feeds_wait_for_arrived_messages() -> None:
     arrived = [True]
     driver = Driver(Feeding(), lambda: arrived[0])
     chain(driver, "a")
-    driver.feeding.feeds.append(Fed(HandOver(driver), [10]))
+    driver.feeding.feeds.append(Fed(LocalEmitter(driver), [10]))
 
     drive(driver)
     assert driver.operators[0].firings == 0
@@ -122,7 +122,7 @@ def calls_of_a_firing(messages: int = 40) -> float:
     """Calls of Python functions for each firing of a chain, once it runs, but for those that seed what is loaded."""
     driver = Driver()
     chain(driver, *"abcdefgh")
-    driver.feeding.feeds.append(Fed(HandOver(driver), [1000 * k for k in range(1, 2 * messages + 1)]))
+    driver.feeding.feeds.append(Fed(LocalEmitter(driver), [1000 * k for k in range(1, 2 * messages + 1)]))
     firings, calls = 8 * messages, 0
 
     def count(frame: FrameType, event: str, _: object) -> None:

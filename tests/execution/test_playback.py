@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, Offer, _steered, keys, looped, pressed
+from dataflow.cli.commands.playback import ENDING, KEEPING, PLAYING, KeyBindings, _steered, keys, looped, pressed
 from dataflow.execution.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
@@ -105,7 +105,10 @@ def test_keys_match_the_help_text(typed: bytes, meant: list[str]) -> None:
     ids=["flight recorder", "no flight recorder", "live"],
 )
 def test_terminal_keys_control_playback_and_restore_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], offers: tuple[Offer, ...], meant: list[str]
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    offers: tuple[KeyBindings, ...],
+    meant: list[str],
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []

@@ -11,7 +11,7 @@ from firing_operators import Collector, Dice, entry, node, run_all, value
 
 from dataflow.execution.failure import OperatorFailure
 from dataflow.execution.generators import shared_generators
-from dataflow.execution.generators.shared_generators import AtWork, SharedGenerators, Tripwire
+from dataflow.execution.generators.shared_generators import CallTracker, SharedGenerators, Tripwire
 from dataflow.execution.runner import OperatorRunner
 from dataflow.execution.source import SourceRunner
 from dataflow.messages import FeatureVector, Message
@@ -73,7 +73,7 @@ def test_random_draws_of_a_source_are_independent_of_other_operators() -> None:
 
 def test_a_live_source_that_draws_beside_operators_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     runner, _ = source(live=True)
-    work = AtWork()
+    work = CallTracker()
     runner._tripwire = Tripwire(work)
 
     assert runner.take() is not None
@@ -86,7 +86,7 @@ def test_a_live_source_that_draws_beside_operators_is_refused(monkeypatch: pytes
 
 
 def test_draws_while_an_operator_is_at_work_are_its_own() -> None:
-    work = AtWork()
+    work = CallTracker()
     work.fires = True
     wire = Tripwire(work)
 
@@ -107,8 +107,8 @@ def test_draws_while_an_operator_is_at_work_are_its_own() -> None:
 
 
 def test_every_call_of_an_operator_counts_as_work() -> None:
-    before = shared_generators.AT_WORK.begun
+    before = shared_generators.CALLS_IN_PROGRESS.begun
     beside(drawing=False)
 
-    assert shared_generators.AT_WORK.begun - before >= 7
-    assert shared_generators.AT_WORK.begun == shared_generators.AT_WORK.ended
+    assert shared_generators.CALLS_IN_PROGRESS.begun - before >= 7
+    assert shared_generators.CALLS_IN_PROGRESS.begun == shared_generators.CALLS_IN_PROGRESS.ended

@@ -17,7 +17,7 @@ import graph_operators
 import pytest
 from rich.console import Console, RenderableType
 
-from dataflow.graph.catalogue import BUILT_IN, Described, discover, find, look_up, page, parameters, table
+from dataflow.graph.catalogue import BUILT_IN, CatalogueEntry, discover, find, look_up, page, parameters, table
 from dataflow.graph.lookup import is_concrete
 from dataflow.messages import Number
 from dataflow.operator import KEPT, In, Operator
@@ -52,7 +52,7 @@ def test_an_operator_is_found_by_its_former_path(monkeypatch: pytest.MonkeyPatch
     moved = {"graph_operators:Merger": "graph_operators:Fuse", "graph_operators:Gone": "graph_operators:Nowhere"}
     monkeypatch.setattr(graph_operators, "MOVED_OPERATORS", moved, raising=False)
 
-    assert look_up("graph_operators:Merger") == Described("graph_operators:Fuse", graph_operators.Fuse)
+    assert look_up("graph_operators:Merger") == CatalogueEntry("graph_operators:Fuse", graph_operators.Fuse)
     with pytest.raises(LookupError, match="module 'graph_operators' has no operator 'Nowhere'"):
         look_up("graph_operators:Gone")
 
@@ -77,7 +77,7 @@ def test_a_failing_module_is_reported_and_the_others_still_listed(
 
 
 def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
-    camera = Described("graph_operators:Camera", graph_operators.Camera).to_json()
+    camera = CatalogueEntry("graph_operators:Camera", graph_operators.Camera).to_json()
     assert camera["source"]
     assert camera["params"][0] == {
         "name": "rate",
@@ -94,23 +94,25 @@ def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
         ("depth", ["TestDepth"], False),
         ("info", ["TestLens"], True),
     ]
-    odometry = Described("graph_operators:Odometry", graph_operators.Odometry).to_json()
+    odometry = CatalogueEntry("graph_operators:Odometry", graph_operators.Odometry).to_json()
     assert [(i["name"], i["kind"], i["required"], i["before"]) for i in odometry["inputs"]] == [
         ("image", "in", True, 0),
         ("map", "sampled", False, 1),
         ("hint", "sampled", False, 0),
     ]
-    assert Described("x:Mapper", graph_operators.Mapper).to_json()["fires"] == "on cloud and pose joined within 20ms"
-    assert Described("x:Watchdog", graph_operators.Watchdog).to_json()["fires"] == "every 100ms"
+    assert (
+        CatalogueEntry("x:Mapper", graph_operators.Mapper).to_json()["fires"] == "on cloud and pose joined within 20ms"
+    )
+    assert CatalogueEntry("x:Watchdog", graph_operators.Watchdog).to_json()["fires"] == "every 100ms"
 
 
 def test_details_show_everything_declared() -> None:
-    text = shown(page(Described("graph_operators:CloudBuilder", graph_operators.CloudBuilder)))
+    text = shown(page(CatalogueEntry("graph_operators:CloudBuilder", graph_operators.CloudBuilder)))
     for words in ("CloudBuilder", "In", "TestDepth", "depth image", ">= 1", "fast", "keep every stride-th pixel"):
         assert words in text
     (window,) = [row for row in parameters(graph_operators.CloudBuilder) if row["name"] == "window"]
     assert (window["type"], window["default"]) == ("duration", "0s")
-    text = shown(page(Described("graph_operators:Detector", graph_operators.Detector)))
+    text = shown(page(CatalogueEntry("graph_operators:Detector", graph_operators.Detector)))
     assert "must be given" in text
     assert "list[str]" in text
 
@@ -135,15 +137,15 @@ class WatchingMore(Watching):
 
 def test_the_fields_of_a_declared_state_are_shown_with_their_types() -> None:
     for cls in (Watching, WatchingMore):
-        assert Described("x:Watching", cls).to_json()["state"] == [
+        assert CatalogueEntry("x:Watching", cls).to_json()["state"] == [
             {"name": "last", "type": "Number | None", "kept": False},
             {"name": "ages", "type": "dict[int, list[float]]", "kept": False},
             {"name": "counts", "type": "Counter[str]", "kept": True},
         ]
-        text = shown(page(Described("x:Watching", cls)))
+        text = shown(page(CatalogueEntry("x:Watching", cls)))
         assert re.search(r"ages +dict\[int, list\[float\]\]", text)
         assert re.search(r"counts +Counter\[str\] +kept by a reset of the clock", text)
-    assert Described("x:Mapper", graph_operators.Mapper).to_json()["state"] == []
+    assert CatalogueEntry("x:Mapper", graph_operators.Mapper).to_json()["state"] == []
 
 
 def test_single_operator_is_looked_up_by_name_or_path() -> None:

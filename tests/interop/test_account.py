@@ -15,15 +15,15 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import get_types_from_msg
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.bag import BagError
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
 from dataflow.interop.export.ros2 import export_ros2
 from dataflow.interop.export.source import ExportSource
 from dataflow.interop.opening import open_bag
-from dataflow.interop.playing import Wishes, readable
-from dataflow.interop.seen import Seen
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.playing import BagReadOptions, readable
+from dataflow.interop.streams import BagStreams, MappedTopic
 from dataflow.messages import Image, Image16, Measurement, Number, PointCloud, RangeReading
 from dataflow.recording import Recording
 from dataflow.recording.layout import BAG
@@ -70,7 +70,7 @@ def test_strict_refuses_a_message_that_cannot_be_read_and_names_it(tmp_path: Pat
     bag = write_ros2(tmp_path / "bag", rows)
 
     with pytest.raises(BagError, match="'/img', message 0"):
-        converted(bag, tmp_path / "o.mcap", wishes=Wishes(strict=True))
+        converted(bag, tmp_path / "o.mcap", wishes=BagReadOptions(strict=True))
 
 
 def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_message_that_is_cut_off_is_counted_while_times_are_looked_for(tmp_pat
             data = ROS2.serialize_cdr(message, "sensor_msgs/msg/Imu")
             writer.write(connection, time, bytes(data)[: 6 if i == 2 else None])
 
-    with BagStreams(tmp_path / "bag", {"imu": Played("/imu", "Imu")}) as streams:
+    with BagStreams(tmp_path / "bag", {"imu": MappedTopic("/imu", "Imu")}) as streams:
         assert len(list(streams.messages())) == 5
         assert streams.account.unread["/imu"].count == 1
 
@@ -157,7 +157,7 @@ def test_a_field_that_a_newer_definition_has_more_is_named_and_the_rest_is_read(
 
 
 def test_fields_that_were_read_or_hold_nothing_are_not_named() -> None:
-    seen = Seen(ros("sensor_msgs/Range", header=header(5, "sonar"), range=1.5, max_range=4.0))
+    seen = TrackedMessage(ros("sensor_msgs/Range", header=header(5, "sonar"), range=1.5, max_range=4.0))
 
     assert seen.range == 1.5
     assert seen.unread() == ("max_range",)
@@ -204,8 +204,8 @@ def test_16_bit_images_are_8_bits_or_depth_where_that_is_asked_for(tmp_path: Pat
     deep = np.full((4, 6), 1234, np.uint16)
     bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, "mono16", deep.tobytes(), 6, 4, 12)) for s in STAMPS])
 
-    converted(bag, tmp_path / "lossy.mcap", wishes=Wishes(lossy=True))
-    converted(bag, tmp_path / "depth.mcap", wishes=Wishes(depth={"/d": 1000}))
+    converted(bag, tmp_path / "lossy.mcap", wishes=BagReadOptions(lossy=True))
+    converted(bag, tmp_path / "depth.mcap", wishes=BagReadOptions(depth={"/d": 1000}))
 
     assert type(read(tmp_path / "lossy.mcap", "d")[0]) is Image
     assert read(tmp_path / "depth.mcap", "d")[0].data[0, 0] == np.float32(1.234)
@@ -216,8 +216,8 @@ def test_depth_is_of_the_units_that_are_given_and_doubtful_ones_are_named(tmp_pa
     deep = np.full((16, 16), 15_000, np.uint16)
     bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, encoding, deep.tobytes(), 16, 16, 32)) for s in STAMPS])
 
-    as_they_are = converted(bag, tmp_path / "mm.mcap", wishes=Wishes(depth={"/d": 1000}))
-    given = converted(bag, tmp_path / "units.mcap", wishes=Wishes(depth={"/d": 5000}))
+    as_they_are = converted(bag, tmp_path / "mm.mcap", wishes=BagReadOptions(depth={"/d": 1000}))
+    given = converted(bag, tmp_path / "units.mcap", wishes=BagReadOptions(depth={"/d": 5000}))
 
     assert "with 5000 units a metre it is 3 to 3 m" in as_they_are.account.doubted["/d"]
     assert not given.account.doubted
@@ -228,7 +228,7 @@ def test_depth_in_metres_has_no_units(tmp_path: Path) -> None:
     deep = np.full((4, 6), 1.23456, np.float32)
     bag = write_ros2(tmp_path / "bag", [("/d", s, image(s, "32FC1", deep.tobytes(), 6, 4, 24)) for s in STAMPS])
 
-    account = converted(bag, tmp_path / "d.mcap", wishes=Wishes(depth={"/d": 5000})).account
+    account = converted(bag, tmp_path / "d.mcap", wishes=BagReadOptions(depth={"/d": 5000})).account
 
     assert "not of 16-bit units" in account.unread["/d"].reason
 
@@ -278,7 +278,7 @@ def test_depth_topic_of_another_type_is_refused_with_its_type(tmp_path: Path) ->
     bag = write_ros2(tmp_path / "bag", imus(STAMPS))
 
     with closing(open_bag(bag)) as opened, pytest.raises(BagError, match="read as Imu, which cannot be depth"):
-        readable(opened, bag, wishes=Wishes(depth={"/imu": 1000}))
+        readable(opened, bag, wishes=BagReadOptions(depth={"/imu": 1000}))
 
 
 def test_a_topic_of_two_types_keeps_both_there_and_back(tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ from made_bags import ROS1, SECOND, header, imus, ros, transform, write_ros1, wr
 
 from dataflow.interop.bag import BagError
 from dataflow.interop.opening import is_foreign, open_bag
-from dataflow.interop.streams import BagStreams, Played, recorded_streams
+from dataflow.interop.streams import BagStreams, MappedTopic, recorded_streams
 from dataflow.messages import Imu, Text
 from dataflow.recording import RecordingWriter
 
 STAMPS = [1_700_000_000 * SECOND + i * SECOND // 100 for i in range(40)]
-IMU = {"robot/imu/imu": Played("/imu", "Imu")}
+IMU = {"robot/imu/imu": MappedTopic("/imu", "Imu")}
 
 
 def readings(streams: BagStreams) -> list[float]:
@@ -65,7 +65,7 @@ def test_messages_come_in_the_order_of_their_headers_with_the_span_asked_for(tmp
     rows[3], rows[8] = (rows[8][0], rows[3][1], rows[8][2]), (rows[3][0], rows[8][1], rows[3][2])
     shifted = [("/late", s + SECOND // 3, ros("sensor_msgs/Temperature", header=header(s + 1))) for s in STAMPS[:20]]
     path = write_ros2(tmp_path / "bag", sorted(rows + shifted, key=lambda row: row[1]))
-    played = IMU | {"robot/t/t": Played("/late", "Number")}
+    played = IMU | {"robot/t/t": MappedTopic("/late", "Number")}
 
     with BagStreams(path, played) as streams:
         got = [(m.stamp, m.stream) for m in streams.messages()]
@@ -96,7 +96,7 @@ def test_transforms_of_one_time_are_one_message_and_of_several_times_several(tmp
         [tf(1, transform(a, "map", "odom")), tf(2, transform(b, "odom", "base"), transform(a, "odom", "base"))],
     )
 
-    with BagStreams(path, {"r/tf": Played("/tf", "Transforms")}) as streams:
+    with BagStreams(path, {"r/tf": MappedTopic("/tf", "Transforms")}) as streams:
         got = [(m.stamp, m.seq, m.message.child_frames) for m in streams.messages()]
 
     assert got == [(a, 0, ("odom", "base")), (b, 1, ("base",))]
@@ -119,8 +119,8 @@ def test_static_streams_are_one_message_of_all_transforms_and_the_first_calibrat
         *imus(STAMPS[5:]),
     ]
     played = IMU | {
-        "r/tf": Played("/tf_static", "Transforms", static=True),
-        "r/info": Played("/info", "CameraInfo", static=True),
+        "r/tf": MappedTopic("/tf_static", "Transforms", static=True),
+        "r/info": MappedTopic("/info", "CameraInfo", static=True),
     }
 
     with BagStreams(write_ros2(tmp_path / "bag", rows), played) as streams:
@@ -154,8 +154,8 @@ def test_unknown_topic_or_type_is_refused_with_a_reason(tmp_path: Path) -> None:
     path = write_ros2(tmp_path / "bag", imus(STAMPS))
 
     for played, told in (
-        (Played("/gyro", "Imu"), "has no topic '/gyro'; it has /imu"),
-        (Played("/imu", "Image"), "is read as Imu, not as Image"),
+        (MappedTopic("/gyro", "Imu"), "has no topic '/gyro'; it has /imu"),
+        (MappedTopic("/imu", "Image"), "is read as Imu, not as Image"),
     ):
         with pytest.raises(BagError, match=told):
             BagStreams(path, {"r/s": played})
@@ -196,7 +196,7 @@ def test_equal_messages_of_a_log_without_times_are_not_taken_for_one(tmp_path: P
     rows = [("/said", stamp, ros("std_msgs/String", data="on")) for stamp in log]
     bag = write_ros2(tmp_path / "bag", rows)
 
-    with BagStreams(bag, {"/said": Played("/said", Text.SCHEMA)}) as opened:
+    with BagStreams(bag, {"/said": MappedTopic("/said", Text.SCHEMA)}) as opened:
         stamps = [found.message.stamp for found in opened.messages()]
 
     assert stamps == [stamp + i % (6 if log[-1] == 0 else 3) for i, stamp in enumerate(log)]

@@ -26,8 +26,8 @@ from dataflow.interop.export.source import ExportSource
 from dataflow.interop.export.tables import export_csv, export_parquet
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ros import CONVERSIONS
-from dataflow.interop.ros.made import typestore
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.construction import typestore
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.messages import (
     Boxes3D,
     CameraInfo,

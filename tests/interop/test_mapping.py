@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from dataflow.interop.mapping import MappingError, Offered, Wanted, parse_map, propose
+from dataflow.interop.mapping import AvailableTopic, MappingError, SourceStream, parse_map, propose
 
 
-def wanted(name: str, *types: str, needed: bool = True, static: bool = False) -> Wanted:
-    return Wanted(f"robot/{name}", name, types, static, needed)
+def wanted(name: str, *types: str, needed: bool = True, static: bool = False) -> SourceStream:
+    return SourceStream(f"robot/{name}", name, types, static, needed)
 
 
 IMAGE, DEPTH = wanted("camera/image", "Image"), wanted("camera/depth", "DepthImage")
@@ -16,7 +16,7 @@ LEFT, RIGHT = wanted("camera/left", "Image"), wanted("camera/right", "Image")
 
 
 def test_unambiguous_types_settle_the_mapping() -> None:
-    topics = [Offered("/rgb", ("Image",), 5), Offered("/d", ("CompressedDepth", "DepthImage"), 5)]
+    topics = [AvailableTopic("/rgb", ("Image",), 5), AvailableTopic("/d", ("CompressedDepth", "DepthImage"), 5)]
 
     found = propose([IMAGE, DEPTH], topics, {})
 
@@ -28,7 +28,10 @@ def test_unambiguous_types_settle_the_mapping() -> None:
 
 
 def test_names_propose_where_types_leave_a_choice() -> None:
-    topics = [Offered("/stereo/right/image_rect", ("Image",), 5), Offered("/stereo/left/image_rect", ("Image",), 5)]
+    topics = [
+        AvailableTopic("/stereo/right/image_rect", ("Image",), 5),
+        AvailableTopic("/stereo/left/image_rect", ("Image",), 5),
+    ]
 
     found = propose([LEFT, RIGHT], topics, {})
 
@@ -40,11 +43,11 @@ def test_names_propose_where_types_leave_a_choice() -> None:
 
 
 def test_one_topic_for_two_streams_is_no_certainty() -> None:
-    assert not propose([LEFT, RIGHT], [Offered("/image", ("Image",), 5)], {}).settled
+    assert not propose([LEFT, RIGHT], [AvailableTopic("/image", ("Image",), 5)], {}).settled
 
 
 def test_given_topics_are_taken_and_not_proposed_again() -> None:
-    topics = [Offered("/a", ("Image",), 5), Offered("/b", ("Image",), 5)]
+    topics = [AvailableTopic("/a", ("Image",), 5), AvailableTopic("/b", ("Image",), 5)]
 
     found = propose([LEFT, RIGHT], topics, {"robot/camera/left": "/b"})
 
@@ -54,14 +57,14 @@ def test_given_topics_are_taken_and_not_proposed_again() -> None:
 
 def test_optional_stream_is_mapped_only_if_given() -> None:
     spare = wanted("camera/ground_truth", "Pose", needed=False)
-    topics = [Offered("/pose", ("Pose",), 5)]
+    topics = [AvailableTopic("/pose", ("Pose",), 5)]
 
     assert propose([spare], topics, {}).matches == ()
     assert len(propose([spare], topics, {spare.stream: "/pose"}).matches) == 1
 
 
 def test_missing_streams_are_named() -> None:
-    assert [w.name for w in propose([IMAGE], [Offered("/pose", ("Pose",), 5)], {}).missing] == ["camera/image"]
+    assert [w.name for w in propose([IMAGE], [AvailableTopic("/pose", ("Pose",), 5)], {}).missing] == ["camera/image"]
 
 
 def test_words_of_map_are_checked() -> None:
@@ -74,4 +77,4 @@ def test_words_of_map_are_checked() -> None:
         with pytest.raises(MappingError, match=told):
             parse_map([word], [IMAGE], ["/a"])
     with pytest.raises(MappingError, match="takes Image"):
-        propose([IMAGE], [Offered("/a", ("Pose",), 1)], {IMAGE.stream: "/a"})
+        propose([IMAGE], [AvailableTopic("/a", ("Pose",), 1)], {IMAGE.stream: "/a"})

@@ -15,7 +15,7 @@ from dataflow.interop.account import Account
 from dataflow.interop.export.own import export_own
 from dataflow.interop.export.report import Exported
 from dataflow.interop.export.source import ExportSource
-from dataflow.interop.ros.made import with_covariance
+from dataflow.interop.ros.construction import with_covariance
 from dataflow.messages import Message
 from dataflow.recording import Recording
 

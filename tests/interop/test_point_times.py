@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from made_bags import SECOND, header, ros, xyzw
 
+from dataflow.interop.access_tracking import TrackedMessage
 from dataflow.interop.ros.clouds import point_times
 from dataflow.interop.ros.images import camera_info, compressed
 from dataflow.interop.ros.poses import transforms
 from dataflow.interop.ros.sensors import imu, joint_state, nav_sat_fix
-from dataflow.interop.seen import Seen
 from dataflow.messages import CompressedDepth, CompressedImage
 from dataflow.recording import RecordingError
 
@@ -147,7 +147,7 @@ def test_a_field_that_holds_nothing_sensible_is_unknown_and_the_rest_is_read() -
 
 
 def test_values_of_another_number_than_the_joints_are_unknown_and_named() -> None:
-    seen = Seen(ros("sensor_msgs/JointState", name=["a", "b"], position=np.zeros(2), effort=np.zeros(1)))
+    seen = TrackedMessage(ros("sensor_msgs/JointState", name=["a", "b"], position=np.zeros(2), effort=np.zeros(1)))
 
     joints = joint_state(seen, STAMP)
 

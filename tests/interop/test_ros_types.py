@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from dataflow.interop.conversions import convert
 from dataflow.interop.ros import CONVERSIONS
 from dataflow.interop.ros.clouds import left_out
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.interop.typestores import RosType
 from dataflow.messages import Boxes3D, DepthImage, Image, Message, MessageError, Odometry, Path, Point, Pose
 from dataflow.recording import RecordingError

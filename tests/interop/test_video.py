@@ -20,7 +20,7 @@ from made_recordings import foreign
 from made_video import PERIOD, clip, decoded
 
 from dataflow.interop.opening import open_bag
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.streams import BagStreams, MappedTopic
 from dataflow.interop.topics import Reading
 from dataflow.recording.streams.foxglove import file_descriptor_set
 from dataflow.testing import play
@@ -52,7 +52,7 @@ def compressed(number: int, data: bytes, encoding: str) -> Any:
 
 def images_of(path: Path) -> list[np.ndarray]:
     """Decodes the one topic of a bag; its stamps are those of the frames."""
-    with BagStreams(path, {"video": Played("/video", "CompressedVideo")}) as bag:
+    with BagStreams(path, {"video": MappedTopic("/video", "CompressedVideo")}) as bag:
         packets = [recorded.message for recorded in bag.messages()]
     assert [m.stamp for m in packets] == [START + k * PERIOD for k in range(24)]
     assert all(m.frame == "cam" for m in packets)
@@ -126,7 +126,7 @@ def rerun_file(path: Path, codec: rr.VideoCodec, packets: Sequence[bytes], **tim
 def test_video_streams_of_rerun_files_decode(codec: str, format_: str, of: str, tmp_path: Path) -> None:
     packets = clip(format_)
     path = rerun_file(tmp_path / "video.rrd", codec, packets, of=of)
-    with BagStreams(path, {"video": Played("/cam/video", "CompressedVideo")}) as bag:
+    with BagStreams(path, {"video": MappedTopic("/cam/video", "CompressedVideo")}) as bag:
         found = [recorded.message for recorded in bag.messages()]
         assert "/cam/video is stamped by its timeline 'frame time'" in bag.notes
     assert [m.stamp for m in found] == [START + k * PERIOD for k in range(24)]

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from lint_inputs import MadeInput, simulated
 
 import dataflow
+from dataflow.lint.checks import Report, lint
 from dataflow.lint.clocks import clock_difference
 from dataflow.lint.contract import Contract
-from dataflow.lint.look import Report, lint
 from dataflow.lint.turning import Turning, turning_of
 from operators.sources import SyntheticRgbd
 

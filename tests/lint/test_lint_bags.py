@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from dataflow.cli.main import app
 from dataflow.interop.opening import open_bag
 from dataflow.lint.bags import BagInput
-from dataflow.lint.look import lint
+from dataflow.lint.checks import lint
 
 BEGIN = 1_700_000_000 * SECOND
 TENTH = SECOND // 10

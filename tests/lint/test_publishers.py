@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lint_inputs import MadeInput, every
 
-from dataflow.lint.look import lint
+from dataflow.lint.checks import lint
 from dataflow.messages import CameraInfo, Image, Message, PointCloud
 
 STAMPS = every(0.1)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lint_inputs import BEGIN, SECOND, MadeInput, every
 
+from dataflow.lint.checks import lint
 from dataflow.lint.contract import Contract
-from dataflow.lint.look import lint
 from dataflow.lint.timing import check_gaps, check_order, timing_of
 
 

@@ -11,7 +11,7 @@ import msgpack
 import pytest
 
 from dataflow.client import attach
-from dataflow.client.attach import Lost, elsewhere, find_running, still_runs
+from dataflow.client.attach import MachineUnreachable, elsewhere, find_running, still_runs
 from dataflow.machines.hub import router
 from dataflow.machines.keys import GRAPH_KEY, OVER_KEY
 from dataflow.transport import Bus
@@ -40,7 +40,7 @@ def test_run_continues_while_machine_is_silent_until_lost(endpoint: str, monkeyp
             assert still_runs(found)
         assert still_runs(found)
         monkeypatch.setattr(attach, "LOST_AFTER", 0.0)
-        with pytest.raises(Lost, match=r"/meet was not heard for .*: whether two goes on is not known"):
+        with pytest.raises(MachineUnreachable, match=r"/meet was not heard for .*: whether two goes on is not known"):
             still_runs(found)
 
 

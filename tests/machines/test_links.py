@@ -33,7 +33,7 @@ from dataflow.machines.keys import (
     settings,
 )
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.plan import Meeting
+from dataflow.supervision.plan import Rendezvous
 from dataflow.supervision.run import run
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import NetworkError
@@ -104,7 +104,7 @@ def test_a_link_that_stalls_and_resets_loses_nothing_and_nothing_is_started_agai
 
     report = run(
         load_text(GRAPH),
-        machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+        machines=Rendezvous(f"tls/127.0.0.1:{port}", keys / "laptop"),
         live=True,
         record=tmp_path / "link.mcap",
         watch=once_it_runs(trouble),
@@ -129,7 +129,7 @@ def test_a_slow_link_delays_messages_and_gets_no_process_killed(
 
     report = run(
         load_text(GRAPH.replace("size: 2000}", "size: 25000}, live: {restart: {max: 1, backoff: 10ms}}")),
-        machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+        machines=Rendezvous(f"tls/127.0.0.1:{port}", keys / "laptop"),
         live=True,
     )
 
@@ -154,7 +154,7 @@ def test_an_agent_that_gave_the_run_up_ends_it(keys: Path, link: tuple[int, Rela
     with pytest.raises(RunFailed, match=r"machine 'robot' has left the run: .*; its operators are gone"):
         run(
             load_text(GRAPH.replace("steps: 400", "steps: 1000000")),
-            machines=Meeting(f"tls/127.0.0.1:{port}", keys / "laptop"),
+            machines=Rendezvous(f"tls/127.0.0.1:{port}", keys / "laptop"),
             live=True,
             watch=once_it_runs(stall),
         )
@@ -169,7 +169,7 @@ def test_a_certificate_of_another_authority_or_of_a_tool_joins_nothing(keys: Pat
         keys = Path(shutil.copytree(keys, tmp_path / "keys", ignore=shutil.ignore_patterns("machine")))
     stranger = join("robot", endpoint, tmp_path / "files", "--keys", str(keys / who))
     with pytest.raises(RunFailed, match=r"machine 'robot' did not join"):
-        run(load_text(GRAPH), machines=Meeting(endpoint, keys / "laptop"), start_timeout=4.0)
+        run(load_text(GRAPH), machines=Rendezvous(endpoint, keys / "laptop"), start_timeout=4.0)
     end(stranger)
 
 
@@ -305,7 +305,7 @@ def test_tools_with_keys_follow_a_graph_of_another_machine_and_others_do_not(key
         following.join()
 
     graph = GRAPH.replace("steps: 400", "steps: 1000000") + '  given: {use: "dataflow.remote:Twist"}\n'
-    run(load_text(graph), machines=Meeting(endpoint, keys / "laptop"), live=True, controls=controls)
+    run(load_text(graph), machines=Rendezvous(endpoint, keys / "laptop"), live=True, controls=controls)
 
     end(robot)
     for view in views:

@@ -14,7 +14,7 @@ from needed_programs import need
 
 from dataflow.graph import load_text
 from dataflow.machines.keys import issue, new_authority
-from dataflow.supervision.plan import Meeting
+from dataflow.supervision.plan import Rendezvous
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 
@@ -87,7 +87,7 @@ def test_a_cable_that_is_pulled_loses_nothing_and_only_the_asked_port_listens(
 
     report = run(
         load_text(GRAPH.replace("STEPS", str(steps))),
-        machines=Meeting(endpoint, tmp_path / "laptop"),
+        machines=Rendezvous(endpoint, tmp_path / "laptop"),
         live=True,
         record=tmp_path / "cable.mcap",
         watch=once_it_runs(pull),

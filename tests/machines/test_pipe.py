@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from dataflow.machines import pipe as pipes
-from dataflow.machines.pipe import Clocks, Pipe, Room
+from dataflow.machines.pipe import Clocks, Pipe, SendWindow
 
 
 class Link:
@@ -139,7 +139,7 @@ class SlowLink:
 
     def __init__(self, rate: float, delay: float) -> None:
         self.rate, self.delay = rate, delay
-        self.room = Room()
+        self.room = SendWindow()
         self.now = self.free = 0.0
         self.flying: list[tuple[float, float]] = []  # of each piece: when it was sent, when it is acknowledged
         self.delivered = 0

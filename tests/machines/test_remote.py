@@ -16,7 +16,7 @@ from dataflow.machines import files
 from dataflow.supervision.core import events
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.links import pairs_of
-from dataflow.supervision.plan import LINK, Meeting, RunPlan, process_plans
+from dataflow.supervision.plan import LINK, Rendezvous, RunPlan, process_plans
 from dataflow.supervision.remote import PIECES_ON_THE_WAY, Remote
 
 sys.path.append(str(HERE))
@@ -56,7 +56,7 @@ def met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Orders, list[e
     monkeypatch.chdir(tmp_path)
     for name in ("robot", "arm"):
         Path(f"{name}.bin").write_bytes(name.encode() * (10 * files.PIECE // len(name)))
-    plan = RunPlan(load_text(GRAPH), machines=Meeting("unixsock-stream/none"))
+    plan = RunPlan(load_text(GRAPH), machines=Rendezvous("unixsock-stream/none"))
     processes = process_plans(plan)
     orders, fed = Orders(), list[events.Event]()
     endpoints = dict.fromkeys([*processes, LINK], "none")
@@ -65,11 +65,11 @@ def met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Orders, list[e
         plan, plan.machines, processes, pairs, endpoints, orders, fed.append, lambda *_: None, lambda _: None
     )  # fmt: skip
     for machine in ("robot", "arm"):
-        remote.take(events.Said(LINK, "link", {"machine": machine, "up": True}))
+        remote.take(events.Received(LINK, "link", {"machine": machine, "up": True}))
 
     def says(machine: str, kind: str, label: str = "", /, **fields: Any) -> None:
         word = {"machine": machine, "label": label, "kind": kind, "fields": fields}
-        remote.take(events.Said(LINK, "from", word))
+        remote.take(events.Received(LINK, "from", word))
 
     return orders, fed, says
 
@@ -108,4 +108,4 @@ def test_machine_reports_only_its_own_processes(met: tuple[Orders, list[events.E
     assert not fed
 
     says("robot", "died", "left", code=1)
-    assert fed == [events.Died("left", 1)]
+    assert fed == [events.Exited("left", 1)]

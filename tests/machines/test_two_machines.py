@@ -19,7 +19,7 @@ from joined_agents import HERE, Robot, end, join, taken, wait_until
 from dataflow.graph import load_text
 from dataflow.recording import Recording
 from dataflow.supervision.core.report import RunFailed, RunReport
-from dataflow.supervision.plan import Meeting
+from dataflow.supervision.plan import Rendezvous
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 
@@ -44,7 +44,7 @@ PLAIN = GRAPH.replace("SIZE", "1").replace(", MORE", "")
 
 def two(robot: Robot, text: str = GRAPH, **options: Any) -> RunReport:
     graph = load_text(text.replace("SIZE", "1").replace(", MORE", ""))
-    return run(graph, machines=Meeting(robot.endpoint), **options)
+    return run(graph, machines=Rendezvous(robot.endpoint), **options)
 
 
 @pytest.mark.parametrize("live", [pytest.param(False, marks=pytest.mark.long), True])
@@ -90,7 +90,7 @@ def test_stamps_of_a_machine_whose_clock_is_wrong_are_corrected_where_the_graph_
     agent = join("robot", endpoint, tmp_path / "files", code=tmp_path / "code")
     began = time.time_ns()
 
-    run(load_text(CLOCKS), machines=Meeting(endpoint), live=True, record=tmp_path / "clocks.mcap")
+    run(load_text(CLOCKS), machines=Rendezvous(endpoint), live=True, record=tmp_path / "clocks.mcap")
 
     ended = time.time_ns()
     end(agent)
@@ -159,10 +159,10 @@ def test_a_machine_that_lacks_a_module_is_named_let_go_and_takes_the_next_run(
     other = PLAIN.replace('there: {use: "machine_operators:Scale"', 'there: {use: "own_scale:OwnScale"')
 
     with pytest.raises(RunFailed, match=r"machine 'robot' cannot take part: scales/gains\.py is missing"):
-        run(load_text(other), machines=Meeting(endpoint))
-    report = run(load_text(PLAIN), machines=Meeting(endpoint))
+        run(load_text(other), machines=Rendezvous(endpoint))
+    report = run(load_text(PLAIN), machines=Rendezvous(endpoint))
     with pytest.raises(RunFailed, match="is missing"):
-        run(load_text(other), machines=Meeting(endpoint))
+        run(load_text(other), machines=Rendezvous(endpoint))
 
     assert report.summaries["there"]["taken"] == 120
     assert "was not heard" not in end(agent)
@@ -189,7 +189,7 @@ def test_dead_remote_process_is_restarted_there_or_ends_the_run(robot: Robot, tm
 
 
 def test_a_machine_that_does_not_join_is_named_with_the_command_that_joins_it(tmp_path: Path) -> None:
-    meeting = Meeting(f"unixsock-stream/{tmp_path / 'meet'}")
+    meeting = Rendezvous(f"unixsock-stream/{tmp_path / 'meet'}")
     with pytest.raises(RunFailed, match=r"machine 'robot' did not join\. On each: dataflow join NAME --connect unix"):
         run(load_text(PLAIN), machines=meeting, start_timeout=0.2)
 
@@ -217,7 +217,7 @@ def test_killed_supervisor_leaves_no_operators_and_the_machine_accepts_a_run(tmp
 
     supervisor.wait(timeout=20)
     wait_until(lambda: not there.children(recursive=True))
-    assert run(load_text(PLAIN), machines=Meeting(endpoint)).summaries["there"]["taken"] == 120
+    assert run(load_text(PLAIN), machines=Rendezvous(endpoint)).summaries["there"]["taken"] == 120
     assert "was not heard for 2 s" in end(agent)
 
 
@@ -249,7 +249,7 @@ def test_streams_of_a_run_are_equal_on_one_two_and_three_machines(tmp_path: Path
         )
         for word, machine in places.items():
             text = text.replace(word, f", machine: {machine}" if machine else "")
-        digests.append(run(load_text(text), machines=Meeting(endpoint), window=(16, 1 << 20)).streams)
+        digests.append(run(load_text(text), machines=Rendezvous(endpoint), window=(16, 1 << 20)).streams)
 
     for agent in agents:
         end(agent)

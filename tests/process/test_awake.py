@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataflow.process.awake import LONGEST_STEP, AwakeClock
+from dataflow.process.awake_clock import LONGEST_STEP, AwakeClock
 
 
 class Hands:

@@ -185,7 +185,7 @@ def test_a_pause_of_the_recorder_is_no_time_in_which_firing_records_would_have_c
 ) -> None:
     """As of a stopped container: the clock goes on by 40 s when the span has just ended."""
     now = [0.0]
-    monkeypatch.setattr("dataflow.process.awake.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("dataflow.process.awake_clock.time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def at(stamp: float) -> None:
         now[0] = stamp + 40 * (stamp >= 12.2)

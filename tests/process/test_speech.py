@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.execution.failure import OperatorFailure
-from dataflow.execution.generators.shared_generators import AT_WORK
+from dataflow.execution.generators.shared_generators import CALLS_IN_PROGRESS
 from dataflow.process.log_pipe import LONGEST, MARK, SOURCE_THREAD, _Handler, _Lines, _say, heard, log_failure, shown
 from dataflow.recording.streams.logs import LEVELS, LogLine
 
@@ -52,7 +52,7 @@ def test_line_without_operator_is_attributed_to_the_only_one() -> None:
 
 def test_a_call_under_way_names_its_operator_and_event_time() -> None:
     def speak(descriptor: int) -> None:
-        with AT_WORK.call("lidar", 7):
+        with CALLS_IN_PROGRESS.call("lidar", 7):
             _say(descriptor, "info", "inside", "")
         _say(descriptor, "info", "between", "")
         reader = threading.Thread(target=lambda: _say(descriptor, "info", "x", ""), name=f"{SOURCE_THREAD}camera")

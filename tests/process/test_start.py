@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import dataflow.process.start as starting
-from dataflow.process.start import Forked, fork, start
+from dataflow.process.start import ForkedProcess, fork, start
 
 SAYS = """
 import os, sys
@@ -52,7 +52,7 @@ def test_a_fork_is_what_a_new_interpreter_is(
     monkeypatch.setattr(starting, "_warm", warm)
     variables = {**os.environ, "TOLD": "yes", "PYTHONPATH": str(tmp_path)}
     process, *found = started(module, variables, tmp_path)
-    assert isinstance(process, Forked if warm else subprocess.Popen)
+    assert isinstance(process, ForkedProcess if warm else subprocess.Popen)
     assert found == [7, "yes True", "printed\n"]
 
 
@@ -85,7 +85,7 @@ def test_a_fork_inherits_no_descriptor_but_those_handed_to_it(tmp_path: Path) ->
             return 0
 
         pid = fork(call, (kept.fileno(),), os.environ, (out.fileno(), out.fileno()))
-        assert Forked(pid).wait(timeout=30) == 0
+        assert ForkedProcess(pid).wait(timeout=30) == 0
     found = eval((tmp_path / "out").read_text())
     assert found[:3] == [0, 1, 2]
     assert kept_number(found) == 1
@@ -101,13 +101,13 @@ def test_an_error_of_a_fork_is_printed_and_is_its_exit_code(tmp_path: Path) -> N
         raise ValueError("of the call")
 
     with (tmp_path / "out").open("wb") as out:
-        child = Forked(fork(call, (), os.environ, (out.fileno(), out.fileno())))
+        child = ForkedProcess(fork(call, (), os.environ, (out.fileno(), out.fileno())))
         assert child.wait(timeout=30) == 1
     assert "ValueError: of the call" in (tmp_path / "out").read_text()
 
 
 def test_a_fork_that_hangs_is_killed() -> None:
-    child = Forked(fork(lambda: threading.Event().wait(60) or 0, (), os.environ, None))
+    child = ForkedProcess(fork(lambda: threading.Event().wait(60) or 0, (), os.environ, None))
     with pytest.raises(subprocess.TimeoutExpired):
         child.wait(timeout=0.0)
     assert child.poll() is None

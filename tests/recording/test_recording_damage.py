@@ -219,7 +219,7 @@ def test_damage_in_a_torn_recording_is_noted_too(recording: Path, kind: str) -> 
 def test_an_index_that_disagrees_with_the_statistics_is_not_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Callable[..., Path]
 ) -> None:
-    real = packing.Gathered.add
+    real = packing.PendingChunk.add
 
     def forgetful(self: Any, channel: int, log_time: int, *of_it: Any) -> None:
         real(self, channel, log_time, *of_it)
@@ -230,7 +230,7 @@ def test_an_index_that_disagrees_with_the_statistics_is_not_believed(
     with path.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics
     with monkeypatch.context() as patched:
-        patched.setattr(packing.Gathered, "add", forgetful)
+        patched.setattr(packing.PendingChunk, "add", forgetful)
         patched.setattr(container.ContainerWriter, "_statistics", lambda self: statistics)
         path = record([("a", pose(i)) for i in range(1, 6)])
     with Recording(path) as recording:

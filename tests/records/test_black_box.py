@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.records import black_box as module
-from dataflow.records.black_box import BlackBox, Reached, make_black_box, read_black_box
+from dataflow.records.black_box import BlackBox, OperatorProgress, make_black_box, read_black_box
 from dataflow.records.firing import Emission, FiringRecord, decode_batch
 
 PORTS = {"camera": ("image", "info"), "detector": ("boxes",)}
@@ -36,7 +36,7 @@ def kept(memory: int, operator: str) -> list[int]:
 
 
 def test_a_new_black_box_is_empty(memory: int) -> None:
-    assert read_black_box(memory, PORTS).reached == {"camera": Reached(), "detector": Reached()}
+    assert read_black_box(memory, PORTS).reached == {"camera": OperatorProgress(), "detector": OperatorProgress()}
 
 
 def test_black_box_records_are_read_back_by_operator(memory: int) -> None:
@@ -60,7 +60,7 @@ def test_the_latest_records_are_kept_and_older_ones_leave_where_they_led(memory:
     assert all(b == a + 1 for a, b in pairwise(indices))
     remains = read_black_box(memory, PORTS)
     assert not remains.batches["detector"]
-    assert remains.reached["detector"] == Reached(0, {"boxes": 101}, {"gain": 1}, {"boxes": (0, 2)})
+    assert remains.reached["detector"] == OperatorProgress(0, {"boxes": 101}, {"gain": 1}, {"boxes": (0, 2)})
     assert remains.reached["camera"].last == {"image": 139}
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.mcap.chunks import Chunks
-from dataflow.records.cuts import Taken, cut_record, is_known, taken_by
+from dataflow.records.cuts import ResumePoint, cut_record, is_known, taken_by
 from dataflow.records.firing import CALLS, FiringRecord, Kind, encode_batch
 from dataflow.records.order import Outline, Run
 from dataflow.records.reading import FiringLog, whole
@@ -111,7 +111,7 @@ def test_each_incarnation_is_repeated_with_its_own_code() -> None:
     look_at([repetition])
     assert [repetition.code_of(k) for k in range(5)] == [first, second, second, None, None]
 
-    records[1] = cut_record(records[1], left_out=3, taken=Taken(True, {}, {}, b"s", second), held=(), stamp=1)
+    records[1] = cut_record(records[1], left_out=3, taken=ResumePoint(True, {}, {}, b"s", second), held=(), stamp=1)
     repetition = Repetition(lambda: [*records[:2], *records[3:]], stateless=False)
     look_at([repetition])
     assert [repetition.code_of(k) for k in range(5)] == [first, second, second, None, None]

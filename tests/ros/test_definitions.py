@@ -18,7 +18,7 @@ from example_messages import example
 
 from dataflow.interop.conversions import convert
 from dataflow.interop.ros import CONVERSIONS
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.messages import (
     CameraInfo,
     CompressedDepth,

@@ -16,9 +16,9 @@ from dataflow.records.firing import FiringRecord, Kind, consecutive, encode_batc
 from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.run import run
-from dataflow.verification.books import Books
 from dataflow.verification.complete import complete
 from dataflow.verification.ledger import read_ledger
+from dataflow.verification.record_totals import GraphRecordTotals
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
@@ -206,7 +206,9 @@ def test_finished_operator_needs_another_end_only_if_called_again(
         known = FiringLog.read(recording)
         batches = {name: list(known.batches(name)) for name in known.operators}
         batches["sum"] += [encode_batch([FiringRecord("sum", *place, kind, 10**10)]) for *place, kind in more]
-        account = read_ledger(recording, graph, Books(FiringLog(batches, "test"), graph), ["sum"]).accounts["sum"]
+        account = read_ledger(recording, graph, GraphRecordTotals(FiringLog(batches, "test"), graph), ["sum"]).accounts[
+            "sum"
+        ]
     assert account.finished is finished
 
 

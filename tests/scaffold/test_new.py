@@ -15,7 +15,7 @@ import pytest
 from cli_commands import call
 
 from dataflow.graph import load_graph
-from dataflow.scaffold.files import KINDS, NameFault, camel, operator_files, snake
+from dataflow.scaffold.files import KINDS, InvalidName, camel, operator_files, snake
 
 COMPILER = shutil.which("c++")
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -95,7 +95,7 @@ def test_nothing_that_is_there_is_replaced(tmp_path: Path) -> None:
     [("select", "taken"), ("class", "taken"), ("3d", "cannot be"), ("dataflow", "taken"), ("ü", "cannot")],
 )
 def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> None:
-    with pytest.raises(NameFault, match=words):
+    with pytest.raises(InvalidName, match=words):
         snake(name)
     assert words in call("new", "operator", name, code=2).stderr
     assert (

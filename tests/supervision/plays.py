@@ -9,12 +9,21 @@ from typing import Any
 
 from dataflow.graph import load_text
 from dataflow.process.stacks import ASK
-from dataflow.records.black_box import Reached, Remains
+from dataflow.records.black_box import OperatorProgress, RecoveredRecords
 from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.supervision.configs import configurations
-from dataflow.supervision.core.commands import Command, Over, Send, Signal, Spawn
+from dataflow.supervision.core.commands import Command, RunEnded, Send, Signal, Spawn
 from dataflow.supervision.core.compose import core_of
-from dataflow.supervision.core.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
+from dataflow.supervision.core.events import (
+    Event,
+    Exited,
+    Moment,
+    Received,
+    RecordsRecovered,
+    RunStarted,
+    StopRequested,
+    Tick,
+)
 from dataflow.supervision.core.report import RunFailed, RunReport
 from dataflow.supervision.plan import RunPlan, process_plans
 
@@ -45,7 +54,7 @@ class Play:
         self.stood = 0.0
         """Seconds for which the machine stood still: the clock went on, the supervisor's own did not."""
         self.commands: list[Command] = []
-        self.over: Over | None = None
+        self.over: RunEnded | None = None
         self.deaf: set[str] = set()
         self.broken: set[str] = set()
         self.beating = live
@@ -53,7 +62,7 @@ class Play:
         """What processes answer when they are asked how they are; None: they are too busy to answer."""
         self.alive: set[str] = set()
         self.kept: dict[str, list[bytes]] = {}
-        self.reached: dict[str, Reached] = {}
+        self.reached: dict[str, OperatorProgress] = {}
         self._answers: deque[Event] = deque()
 
     # The clock
@@ -83,8 +92,8 @@ class Play:
     def works(self, label: str) -> bool:
         return label in self.alive and label not in self.deaf and not label.startswith("@")
 
-    def beat(self, label: str, work: tuple[str, int, float] | None = None) -> Said:
-        return Said(label, "beat", {"memory": 1, "work": work})
+    def beat(self, label: str, work: tuple[str, int, float] | None = None) -> Received:
+        return Received(label, "beat", {"memory": 1, "work": work})
 
     # What processes do
 
@@ -98,7 +107,7 @@ class Play:
                 self.dies(label, -9)
             case Send(label, kind, fields) if label in self.alive and label not in self.deaf:
                 self._answers.extend(self._answer(label, kind, fields))
-            case Over():
+            case RunEnded():
                 assert self.over is None
                 self.over = command
 
@@ -109,14 +118,16 @@ class Play:
         """A process ends; in a live run, what it has kept of its firing records is read."""
         self.alive.discard(label)
         nodes = self.processes[label].nodes
-        remains = Remains({n: self.kept.pop(n, []) for n in nodes}, {n: self.reached.get(n, Reached()) for n in nodes})
-        return [*([Remained(label, remains)] if self.plan.live and nodes else []), Died(label, code)]
+        remains = RecoveredRecords(
+            {n: self.kept.pop(n, []) for n in nodes}, {n: self.reached.get(n, OperatorProgress()) for n in nodes}
+        )
+        return [*([RecordsRecovered(label, remains)] if self.plan.live and nodes else []), Exited(label, code)]
 
     def keeps(self, *records: FiringRecord) -> None:
         """Operators write these into the black boxes of their processes."""
         for record in records:
             self.kept.setdefault(record.operator, []).append(encode_batch([record]))
-            self.reached.setdefault(record.operator, Reached()).take(
+            self.reached.setdefault(record.operator, OperatorProgress()).take(
                 record, tuple(self.plan.graph.nodes[record.operator].outputs)
             )
 
@@ -125,39 +136,41 @@ class Play:
             case "operators" | "sink" if label in self.broken:
                 return [self.failed(label, "setup()")]
             case "operators" | "sink":
-                return [Said(label, "joined", {}), Said(label, "ready", {"first": None, "steps": None})]
+                return [Received(label, "joined", {}), Received(label, "ready", {"first": None, "steps": None})]
             case "probe":
                 return [
-                    Said(other, "seen", {"stream": stream})
+                    Received(other, "seen", {"stream": stream})
                     for other in self.processes
                     if other in self.alive and other not in self.deaf
                     for stream in self.processes[label].publish
                 ]
             case "poll" if self.state is not None:
-                return [Said(label, "state", IDLE | self.state | {"round": fields["round"]})]
+                return [Received(label, "state", IDLE | self.state | {"round": fields["round"]})]
             case "leave":
-                return [Said(label, "closed", {"facts": {}}), *self._ends(label, 0)]
+                return [Received(label, "closed", {"facts": {}}), *self._ends(label, 0)]
         return []
 
-    def failed(self, label: str, when: str) -> Said:
+    def failed(self, label: str, when: str) -> Received:
         fields = {"operator": label, "when": when, "summary": "RuntimeError: no camera", "traceback": "…"}
         fields["where"] = "driver.py:7"
-        return Said(label, "failed", fields)
+        return Received(label, "failed", fields)
 
-    def progress(self, label: str, done: Mapping[str, int] | None = None, **more: Any) -> Said:
+    def progress(self, label: str, done: Mapping[str, int] | None = None, **more: Any) -> Received:
         done = done or {}
         counts = {name: [1, 1, 0, 0, stamp] for name, stamp in done.items()}
-        return Said(label, "progress", {"done": done, "counts": counts, **more})
+        return Received(label, "progress", {"done": done, "counts": counts, **more})
 
-    def ended(self, label: str) -> Said:
+    def ended(self, label: str) -> Received:
         """A process has ended, having heard everything that it was told to expect."""
         expected = self.core.run.processes[label].expected
-        return Said(label, "ended", {"report": {"counts": {}, "streams": {}, "transport": {}, "expected": expected}})
+        return Received(
+            label, "ended", {"report": {"counts": {}, "streams": {}, "transport": {}, "expected": expected}}
+        )
 
     # Scenes
 
     def begins(self) -> None:
-        self.tell(Begin())
+        self.tell(RunStarted())
 
     def starts(self) -> Play:
         self.begins()
@@ -166,7 +179,7 @@ class Play:
         return self
 
     def stops(self) -> list[Command]:
-        return self.tell(StopAsked())
+        return self.tell(StopRequested())
 
     def ends(self) -> RunReport:
         """All processes hand in their reports, and the run closes."""

@@ -14,16 +14,16 @@ import pytest
 
 from dataflow.machines import files
 from dataflow.machines.pipe import Clocks
-from dataflow.records.black_box import Reached, Remains
+from dataflow.records.black_box import OperatorProgress, RecoveredRecords
 from dataflow.supervision import agent
-from dataflow.supervision.agent import Stay
+from dataflow.supervision.agent import RunParticipation
 from dataflow.supervision.core import events
 
 
 def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace())
     (tmp_path / "models").write_text("a file where a folder would be")
-    stay = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")
+    stay = RunParticipation(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "none")
     piece = {"path": "models/net.bin", "at": 0, "data": b"x", "last": True, "digest": ""}
     with pytest.raises(files.FilesError, match=r"'models/net\.bin' cannot be written into /.*: File exists"):
         stay._take_piece(piece)
@@ -47,7 +47,7 @@ def test_clock_offset_is_sent_only_to_running_processes(monkeypatch: pytest.Monk
     clocks.exchanged(100, 1600, 1700, 1200)
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace(clocks=clocks))
     monkeypatch.setattr(agent, "CLOCK_EVERY", 0.0)
-    stay, children = Stay(SimpleNamespace(name="robot"), None, "run", "none"), Children()
+    stay, children = RunParticipation(SimpleNamespace(name="robot"), None, "run", "none"), Children()
     stay._children, stay._corrected = children, frozenset({"camera"})
 
     for _ in range(2):  # started, and started again
@@ -62,12 +62,14 @@ def test_clock_offset_is_sent_only_to_running_processes(monkeypatch: pytest.Monk
 
 
 @pytest.fixture
-def stay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[Stay, list[tuple[Any, ...]]]]:
+def stay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunParticipation, list[tuple[Any, ...]]]]:
     """A stay on a machine, and what it says: the label, the word, and its fields."""
     said: list[tuple[Any, ...]] = []
     monkeypatch.setattr(agent, "Pipe", lambda *_, **__: SimpleNamespace(clocks=Clocks()))
-    monkeypatch.setattr(Stay, "_say", lambda _, label, word, /, **fields: said.append((label, word, fields)))
-    made = Stay(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "tcp/router")
+    monkeypatch.setattr(
+        RunParticipation, "_say", lambda _, label, word, /, **fields: said.append((label, word, fields))
+    )
+    made = RunParticipation(SimpleNamespace(name="robot", folder=tmp_path), None, "run", "tcp/router")
     yield made, said
     for descriptor in (made._woken, made._waking, made._wake):
         os.close(descriptor)
@@ -85,7 +87,7 @@ def hashed(data: bytes) -> str:
 
 
 def test_a_file_that_comes_in_pieces_is_in_its_place_when_it_is_whole_and_right(
-    stay: tuple[Stay, list[Any]], tmp_path: Path
+    stay: tuple[RunParticipation, list[Any]], tmp_path: Path
 ) -> None:
     there, said = stay
     there._obey("", "file", piece(b"wide: ", 0, last=False, whole=b"wide: 3\n"))
@@ -99,7 +101,7 @@ def test_a_file_that_comes_in_pieces_is_in_its_place_when_it_is_whole_and_right(
 
 
 def test_a_file_that_differs_is_outside_or_is_too_large_is_refused(
-    stay: tuple[Stay, list[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stay: tuple[RunParticipation, list[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there, _ = stay
     with pytest.raises(files.FilesError, match=r"file 'maps/hall\.yaml' changed while it was sent"):
@@ -114,7 +116,9 @@ def test_a_file_that_differs_is_outside_or_is_too_large_is_refused(
         there._obey("", "file", piece(b"6", 5, last=True, whole=b"x"))
 
 
-def test_machine_reports_missing_files_and_differences(stay: tuple[Stay, list[Any]], tmp_path: Path) -> None:
+def test_machine_reports_missing_files_and_differences(
+    stay: tuple[RunParticipation, list[Any]], tmp_path: Path
+) -> None:
     there, said = stay
     (tmp_path / "same.yaml").write_bytes(b"same")
     digests = {"same.yaml": hashed(b"same"), "new": hashed(b"new")}
@@ -129,34 +133,42 @@ def test_machine_reports_missing_files_and_differences(stay: tuple[Stay, list[An
 @pytest.mark.parametrize(
     ("event", "word"),
     [
-        (events.Said("sum", "progress", {"a": 1}), ("sum", "said", {"kind": "progress", "fields": {"a": 1}})),
-        (events.HungUp("sum"), ("sum", "hung up", {})),
+        (events.Received("sum", "progress", {"a": 1}), ("sum", "said", {"kind": "progress", "fields": {"a": 1}})),
+        (events.Disconnected("sum"), ("sum", "hung up", {})),
         (
             events.NotReading("sum", 2.5, 9, True),
             ("sum", "not reading", {"seconds": 2.5, "waiting": 9, "overflowed": True}),
         ),
-        (events.Died("sum", -9), ("sum", "died", {"code": -9})),
+        (events.Exited("sum", -9), ("sum", "died", {"code": -9})),
         (
-            events.LeftBehind(("sum", "left"), ("cat (process 3)",)),
+            events.OrphansKilled(("sum", "left"), ("cat (process 3)",)),
             ("", "left", {"labels": ["sum", "left"], "processes": ["cat (process 3)"]}),
         ),
         (events.Aborted("no memory"), ("", "failed", {"why": "no memory"})),
         (
-            events.Remained("sum", Remains({"sum": [b"x"]}, {"sum": Reached(2, {"mean": 5})})),
-            ("sum", "remained", {"batches": {"sum": [b"x"]}, "reached": {"sum": [*astuple(Reached(2, {"mean": 5}))]}}),
+            events.RecordsRecovered(
+                "sum", RecoveredRecords({"sum": [b"x"]}, {"sum": OperatorProgress(2, {"mean": 5})})
+            ),
+            (
+                "sum",
+                "remained",
+                {"batches": {"sum": [b"x"]}, "reached": {"sum": [*astuple(OperatorProgress(2, {"mean": 5}))]}},
+            ),
         ),
     ],
     ids=["said", "hung up", "not reading", "died", "left behind", "aborted", "remained"],
 )
 def test_news_of_processes_go_to_the_supervisor(
-    event: events.Event, word: tuple[Any, ...], stay: tuple[Stay, list[Any]]
+    event: events.Event, word: tuple[Any, ...], stay: tuple[RunParticipation, list[Any]]
 ) -> None:
     there, said = stay
     there._feed(event)
     assert said == [word]
 
 
-def test_a_process_is_configured_for_this_machine_and_goes_by_its_clock(stay: tuple[Stay, list[Any]]) -> None:
+def test_a_process_is_configured_for_this_machine_and_goes_by_its_clock(
+    stay: tuple[RunParticipation, list[Any]],
+) -> None:
     """The clock here is 1.5 s behind the supervisor's."""
     there, _ = stay
     given: list[tuple[str, dict[str, Any]]] = []

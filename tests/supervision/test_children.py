@@ -11,8 +11,17 @@ import pytest
 
 from dataflow.process.channel import Channel, QueuedChannel
 from dataflow.supervision.children import NOT_READING_AFTER, Children
-from dataflow.supervision.core.events import Aborted, Died, Event, HungUp, LeftBehind, NotReading, Printed, Said
-from dataflow.supervision.nursery import Child, End, Leftovers, NurseryFailed
+from dataflow.supervision.core.events import (
+    Aborted,
+    Disconnected,
+    Event,
+    Exited,
+    NotReading,
+    OrphansKilled,
+    Printed,
+    Received,
+)
+from dataflow.supervision.nursery import Child, ChildExited, NurseryFailed, Orphans
 
 
 class PlayedNursery:
@@ -20,7 +29,7 @@ class PlayedNursery:
 
     def __init__(self) -> None:
         self.ends: list[tuple[Channel, int]] = []
-        self.news: list[End | Leftovers] = []
+        self.news: list[ChildExited | Orphans] = []
         self.failure: NurseryFailed | None = None
         self.closed = False
         self._reading, self._writing = os.pipe()
@@ -36,7 +45,7 @@ class PlayedNursery:
         self.ends.append((Channel(channel.theirs), writing))
         return Child(channel, reading)
 
-    def receive(self) -> list[End | Leftovers]:
+    def receive(self) -> list[ChildExited | Orphans]:
         if self.failure is not None:
             raise self.failure
         return self.news
@@ -74,7 +83,7 @@ class Scene:
                 self.children.look(key, mask)
         return self.events[before:]
 
-    def hears(self, *news: End | Leftovers) -> list[Event]:
+    def hears(self, *news: ChildExited | Orphans) -> list[Event]:
         """Reads what the nursery reports; returns the new events."""
         before, self.nursery.news = len(self.events), list(news)
         os.write(self.nursery._writing, b"!")
@@ -99,16 +108,24 @@ def test_messages_and_lines_become_events_of_their_process(scene: Scene) -> None
     scene.said_by_b.send("joined")
     os.write(scene.printed, b"one\ntwo\nthr")
     assert sorted(map(str, scene.looks())) == sorted(
-        map(str, [Said("a", "ready", {"first": 7}), Said("b", "joined", {}), Printed("a", "one"), Printed("a", "two")])
+        map(
+            str,
+            [
+                Received("a", "ready", {"first": 7}),
+                Received("b", "joined", {}),
+                Printed("a", "one"),
+                Printed("a", "two"),
+            ],
+        )
     )
 
 
 def test_messages_and_output_of_a_process_precede_its_death(scene: Scene) -> None:
     scene.said.send("closed", facts={})
     os.write(scene.printed, b"last words\nand no end")
-    found = scene.hears(End(scene.a, -9))
+    found = scene.hears(ChildExited(scene.a, -9))
     assert found == [
-        Said("a", "closed", {"facts": {}}), Printed("a", "last words"), Printed("a", "and no end"), Died("a", -9)
+        Received("a", "closed", {"facts": {}}), Printed("a", "last words"), Printed("a", "and no end"), Exited("a", -9)
     ]  # fmt: skip
     scene.children.send("a", "go", {})  # news that cross its end go nowhere
     scene.children.signal("a", 9)
@@ -117,16 +134,16 @@ def test_messages_and_output_of_a_process_precede_its_death(scene: Scene) -> Non
 
 def test_a_channel_that_is_closed_is_hung_up_once(scene: Scene) -> None:
     scene.said.close()
-    assert scene.looks() == [HungUp("a")]
+    assert scene.looks() == [Disconnected("a")]
     assert scene.looks() == []
     scene.children.send("a", "go", {})
     scene.children.flush()
-    assert scene.hears(End(scene.a, 0)) == [Died("a", 0)]
+    assert scene.hears(ChildExited(scene.a, 0)) == [Exited("a", 0)]
 
 
 def test_leftover_processes_are_reported_by_name(scene: Scene) -> None:
-    found = scene.hears(Leftovers((scene.b, scene.a), ("sleep (process 12)",)))
-    assert found == [LeftBehind(("b", "a"), ("sleep (process 12)",))]
+    found = scene.hears(Orphans((scene.b, scene.a), ("sleep (process 12)",)))
+    assert found == [OrphansKilled(("b", "a"), ("sleep (process 12)",))]
 
 
 def ticked(scene: Scene, seconds: float) -> list[Event]:
@@ -171,7 +188,7 @@ def test_only_the_latest_of_news_that_replace_each_other_waits(scene: Scene) -> 
 def test_a_nursery_that_is_gone_ends_the_run_and_those_that_it_has_not_started(scene: Scene) -> None:
     scene.nursery.failure = NurseryFailed("it was killed by SIGKILL")
     found = scene.hears()
-    assert found == [Aborted("it was killed by SIGKILL"), Died("a", None), Died("b", None)]
+    assert found == [Aborted("it was killed by SIGKILL"), Exited("a", None), Exited("b", None)]
     before = len(scene.events)
     scene.children.spawn("c")
     assert scene.events[before:] == [Aborted("it was killed by SIGKILL")]

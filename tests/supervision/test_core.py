@@ -7,18 +7,18 @@ import re
 import pytest
 from plays import LEFT, SUM, Play, asked_where, killed, sent, spawned
 
-from dataflow.supervision.core.commands import Announce, Over, Withdraw
+from dataflow.supervision.core.commands import Announce, RunEnded, Withdraw
 from dataflow.supervision.core.events import (
     Aborted,
-    Begin,
-    Died,
-    HungUp,
-    LeftBehind,
+    Disconnected,
+    Exited,
     LinkChanged,
+    OrphansKilled,
     Paused,
-    PlaybackAsked,
+    PlaybackRequested,
     Printed,
-    Said,
+    Received,
+    RunStarted,
     Tick,
 )
 from dataflow.supervision.core.life import how_it_ended
@@ -32,14 +32,14 @@ def test_sources_are_released_when_every_edge_is_proven_and_not_before() -> None
     play = Play()
     play.deaf.add("sum")
 
-    assert spawned(play.tell(Begin())) == ["left", "sum"]
-    play.tell(Said("sum", "joined", {}))
+    assert spawned(play.tell(RunStarted())) == ["left", "sum"]
+    play.tell(Received("sum", "joined", {}))
     assert sent(play.wait(1.0), "probe") == []
-    asked = play.tell(Said("sum", "ready", {"first": 7, "steps": 3}), Tick())
+    asked = play.tell(Received("sum", "ready", {"first": 7, "steps": 3}), Tick())
     assert [label for label, _ in sent(asked, "probe")] == ["left", "sum"]
     assert sent(play.wait(1.0), "go") == []
 
-    released = play.tell(Said("sum", "seen", {"stream": "test/left/fast"}), Tick())
+    released = play.tell(Received("sum", "seen", {"stream": "test/left/fast"}), Tick())
 
     assert Announce(("left", "sum")) in released
     assert [(label, fields["first"]) for label, fields in sent(released, "go")] == [("left", 7), ("sum", 7)]
@@ -59,7 +59,7 @@ def test_a_time_in_which_the_supervisor_did_not_run_is_noted_and_recorded() -> N
 def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
     play = Play(start_timeout=10.0)
     play.deaf.add("sum")
-    play.tell(Begin(), Said("sum", "joined", {}), Said("sum", "ready", {"first": None, "steps": None}))
+    play.tell(RunStarted(), Received("sum", "joined", {}), Received("sum", "ready", {"first": None, "steps": None}))
     play.wait(25.0)
 
     assert play.failure() == "no connection within 10 s on: test/left/fast → sum"
@@ -68,7 +68,7 @@ def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
 def test_a_machine_that_goes_during_the_start_is_waited_for_shortly_and_named() -> None:
     play = Play(start_timeout=1000.0)
     play.deaf.add("sum")
-    play.tell(Begin(), Said("sum", "joined", {}), LinkChanged("arm", ("sum",), up=False))
+    play.tell(RunStarted(), Received("sum", "joined", {}), LinkChanged("arm", ("sum",), up=False))
     play.wait(5.0)
     play.tell(LinkChanged("arm", ("sum",), up=True))
     play.wait(60.0)
@@ -83,7 +83,7 @@ def test_a_machine_that_goes_during_the_start_is_waited_for_shortly_and_named() 
 def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
     play = Play(start_timeout=10.0)
     play.deaf.add("sum")
-    play.tell(Begin(), Said("sum", "joined", {}))
+    play.tell(RunStarted(), Received("sum", "joined", {}))
     play.wait(25.0)
 
     assert play.failure() == "not ready within 10 s: process 'sum'"
@@ -94,7 +94,7 @@ def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
 def test_a_run_starts_and_ends_without_waiting_for_a_tick() -> None:
     play = Play(record="run.mcap")
 
-    play.tell(Begin())
+    play.tell(RunStarted())
     assert play.core.status.phase == "running"
     play.tell(*(play.ended(label) for label in play.processes))
 
@@ -118,7 +118,7 @@ def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
     play.tell(*(play.ended(label) for label in play.processes))
     play.wait(0.2)
 
-    play.tell(play.failed("sum", "close()"), Said("sum", "closed", {"facts": {}}), Died("sum", 1))
+    play.tell(play.failed("sum", "close()"), Received("sum", "closed", {"facts": {}}), Exited("sum", 1))
     play.wait(1.0)
 
     assert play.failure() == "operator 'sum' failed in close(): RuntimeError: no camera"
@@ -164,7 +164,7 @@ def test_consequent_failure_is_noted_and_the_first_cause_stays() -> None:
 
 def test_a_process_that_closes_its_channel_and_does_not_end_is_killed() -> None:
     play = Play().starts()
-    play.tell(HungUp("sum"))
+    play.tell(Disconnected("sum"))
     assert killed(play.wait(9.0)) == []
 
     assert killed(play.wait(3.0)) == ["sum"]
@@ -174,7 +174,7 @@ def test_a_process_that_closes_its_channel_and_does_not_end_is_killed() -> None:
 def test_stall_kills_and_names_processes_without_answer() -> None:
     play = Play(stall_timeout=20.0).starts()
     play.deaf.add("sum")
-    play.tell(Said("sum", "beat", {"memory": 1, "work": None}))
+    play.tell(Received("sum", "beat", {"memory": 1, "work": None}))
 
     play.wait(60.0)
 
@@ -243,10 +243,10 @@ def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
 def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> None:
     play = Play(record="run.mcap")
     play.deaf.add("sum")  # it is being set up
-    play.tell(Begin(), Said("sum", "joined", {}))
+    play.tell(RunStarted(), Received("sum", "joined", {}))
     play.stops()
     play.deaf.discard("sum")
-    play.tell(Said("sum", "closed", {"facts": {}}))
+    play.tell(Received("sum", "closed", {"facts": {}}))
     play.dies("sum", 0)
     play.wait(1.0)
 
@@ -259,7 +259,7 @@ def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> 
 def test_process_still_starting_at_ctrl_c_is_killed_without_failure() -> None:
     play = Play(record="run.mcap")
     play.deaf.add("sum")
-    play.tell(Begin(), Said("sum", "joined", {}))
+    play.tell(RunStarted(), Received("sum", "joined", {}))
     play.stops()
     play.wait(7.0)
 
@@ -340,7 +340,7 @@ def test_failure_details_hold_output_of_the_late_process_and_no_old_output_of_ot
 
 def test_processes_left_behind_are_named() -> None:
     play = Play().starts()
-    play.tell(LeftBehind(("sum",), ("sleep (process 12)",)), LeftBehind(("left", "sum"), ("cat (process 13)",)))
+    play.tell(OrphansKilled(("sum",), ("sleep (process 12)",)), OrphansKilled(("left", "sum"), ("cat (process 13)",)))
     assert play.ends().notes == (
         "process 'sum' left processes behind, which were killed: sleep (process 12)",
         "process 'left' or 'sum' left processes behind, which were killed: cat (process 13)",
@@ -359,8 +359,8 @@ def test_after_the_end_nothing_is_commanded() -> None:
     play = Play().starts()
     play.ends()
 
-    assert play.tell(Tick(), Said("sum", "progress", {"done": {}, "counts": {}}), Died("sum", 0)) == []
-    assert [c for c in play.commands if isinstance(c, Over)] == [play.over]
+    assert play.tell(Tick(), Received("sum", "progress", {"done": {}, "counts": {}}), Exited("sum", 0)) == []
+    assert [c for c in play.commands if isinstance(c, RunEnded)] == [play.over]
 
 
 def test_progress_between_polling_rounds_invalidates_the_proof() -> None:
@@ -407,7 +407,7 @@ def test_first_stamps_and_steps_are_those_of_all_sources() -> None:
     play.deaf |= {"left", "right"}
     play.begins()
     for label, first, steps in (("left", 9, 3), ("right", 7, 5)):
-        play.tell(Said(label, "joined", {}), Said(label, "ready", {"first": first, "steps": steps}))
+        play.tell(Received(label, "joined", {}), Received(label, "ready", {"first": first, "steps": steps}))
     assert (play.core.status.first, play.core.status.steps) == (7, 5)
     play.deaf.clear()
     play.wait(0.2)
@@ -418,19 +418,20 @@ def test_first_stamps_and_steps_are_those_of_all_sources() -> None:
 
 def test_pauses_steps_and_speeds_go_to_all_and_what_processes_say_of_them_is_shown() -> None:
     play = Play()
-    asked = PlaybackAsked("pause", 1, None)
+    asked = PlaybackRequested("pause", 1, None)
     play.deaf.add("sum")
     play.begins()
     assert sent(play.tell(asked), "playback") == []  # nothing is paused that has not begun
     play = Play(record="run.mcap").starts()
-    assert sent(play.tell(PlaybackAsked("step", 3, 0.5)), "playback") == [
+    assert sent(play.tell(PlaybackRequested("step", 3, 0.5)), "playback") == [
         (label, {"action": "step", "steps": 3, "speed": 0.5}) for label in ("left", "sum", "@recorder")
     ]
     play.tell(
-        Said("left", "progress", {"done": {}, "counts": {}, "paused": True}), Said("left", "playback", {"speed": 2.0})
+        Received("left", "progress", {"done": {}, "counts": {}, "paused": True}),
+        Received("left", "playback", {"speed": 2.0}),
     )
     assert (play.core.status.paused, play.core.status.speed) == (True, 2.0)
-    play.tell(Said("left", "progress", {"done": {}, "counts": {}, "paused": False}))
+    play.tell(Received("left", "progress", {"done": {}, "counts": {}, "paused": False}))
     assert not play.core.status.paused
 
 
@@ -439,7 +440,7 @@ def test_a_run_that_is_paused_is_not_stuck() -> None:
     play.state = {"idle": False}
     for _ in range(5):
         play.wait(8.0)
-        play.tell(Said("left", "playback", {"paused": True, "speed": None}))
+        play.tell(Received("left", "playback", {"paused": True, "speed": None}))
     assert play.over is None
     play.wait(11.0)
     assert "no progress for 10 s" in play.failure()
@@ -449,10 +450,14 @@ def test_event_time_goes_by_the_rate_from_the_first_stamp() -> None:
     play = Play(record="run.mcap", rate=2.0)
     play.deaf.add("left")
     play.begins()
-    play.tell(Said("left", "joined", {}), Said("left", "ready", {"first": 5_000_000_000, "steps": None}))
+    play.tell(Received("left", "joined", {}), Received("left", "ready", {"first": 5_000_000_000, "steps": None}))
     play.deaf.clear()
     play.tell(
-        *(Said(label, "seen", {"stream": s}) for label in play.processes for s in play.core.run.processes[label].unseen)
+        *(
+            Received(label, "seen", {"stream": s})
+            for label in play.processes
+            for s in play.core.run.processes[label].unseen
+        )
     )
     play.tell(Tick())
     play.now += 1.5
@@ -472,7 +477,7 @@ def test_report_collects_the_figures_of_processes() -> None:
     }
     for label, each in counts.items():
         handed_in = {"counts": each, "streams": {}, "transport": {"sent": 1}, "expected": 0, **more.get(label, {})}
-        play.tell(Said(label, "ended", {"report": handed_in}))
+        play.tell(Received(label, "ended", {"report": handed_in}))
     report = play.report
     assert report.digests() == {"test/left/fast": "abc"}
     assert report.operators["left"] == OperatorCounts(3, 6, 0, 9, 90, 12)

@@ -15,15 +15,15 @@ from dataflow.records.firing import Emission, FiringRecord, encode_batch
 from dataflow.supervision.core.closing import SHORTEST
 from dataflow.supervision.core.commands import Command, Send, Signal, Spawn
 from dataflow.supervision.core.events import (
-    Begin,
     ClockMeasured,
-    Died,
+    Exited,
     LinkChanged,
     NotReading,
     Paused,
-    Said,
+    Received,
+    RunStarted,
     Tick,
-    TriggerAsked,
+    TriggerRequested,
 )
 from dataflow.supervision.core.report import OperatorCounts
 from dataflow.supervision.core.watchers.lateness import held_up_by
@@ -103,7 +103,7 @@ def test_restarts_come_to_an_end() -> None:
 def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() -> None:
     play = robot()
     play.deaf.add("smooth")
-    play.tell(Begin())
+    play.tell(RunStarted())
     play.dies("smooth", -9)
 
     told = play.wait(1.0)
@@ -116,14 +116,14 @@ def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() ->
 
 def test_one_restarted_while_starting_may_see_a_probe_as_soon_as_it_is_ready() -> None:
     play = robot()
-    play.tell(Begin())
+    play.tell(RunStarted())
     play.deaf.add("smooth")
     play.wait(STEP)
     play.dies("smooth", -9)
     while not spawned(play.wait(STEP)):  # the others are probing when its successor is ready
         pass
 
-    play.tell(*(Said("smooth", "seen", {"stream": stream}) for stream in play.processes["smooth"].subscribe))
+    play.tell(*(Received("smooth", "seen", {"stream": stream}) for stream in play.processes["smooth"].subscribe))
     play.wait(1.0)
 
     assert play.core.status.phase == "running"
@@ -132,7 +132,7 @@ def test_one_restarted_while_starting_may_see_a_probe_as_soon_as_it_is_ready() -
 def test_a_set_up_that_fails_is_tried_again_by_the_policy_until_it_is_used_up() -> None:
     play = robot()
     play.broken.add("smooth")
-    play.tell(Begin())
+    play.tell(RunStarted())
     play.wait(5.0)
 
     assert len(spawned(play.commands)) == 3 + 2
@@ -140,7 +140,7 @@ def test_a_set_up_that_fails_is_tried_again_by_the_policy_until_it_is_used_up() 
 
     play = robot()
     play.broken.add("smooth")
-    play.tell(Begin())
+    play.tell(RunStarted())
     play.broken.clear()
     play.wait(1.0)
     assert play.core.status.phase == "running"
@@ -161,7 +161,7 @@ def test_a_set_up_that_fails_after_a_restart_is_tried_again_by_the_policy() -> N
 def test_failed_process_is_restarted_and_a_failed_operator_ends_the_run() -> None:
     play = robot().starts()
     failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "where": "", "traceback": "…"}
-    play.tell(Said("smooth", "failed", failed))
+    play.tell(Received("smooth", "failed", failed))
     play.wait(1.0)
     assert play.core.status.notes[-1] == "process 'smooth' is back"
 
@@ -173,7 +173,7 @@ def test_failed_process_is_restarted_and_a_failed_operator_ends_the_run() -> Non
 def test_a_failure_that_is_outlived_keeps_its_line_and_traceback() -> None:
     play = robot(record="run.mcap").starts()
     failed = {"operator": "smooth", "when": "fire at stamp 5", "summary": "ZeroDivisionError: crashed", "pause": 0.5}
-    play.tell(Said("smooth", "restarting", {**failed, "where": "crashy.py:12", "traceback": "Traceback …"}))
+    play.tell(Received("smooth", "restarting", {**failed, "where": "crashy.py:12", "traceback": "Traceback …"}))
 
     ((_, event),) = sent(play.commands, "event")
     text = "operator 'smooth' failed in fire at stamp 5: ZeroDivisionError: crashed (crashy.py:12); made anew in 0.5 s"
@@ -199,7 +199,9 @@ def test_failed_setup_keeps_its_line_and_traceback_across_the_restart() -> None:
 def test_one_that_failed_and_does_not_leave_is_killed() -> None:
     play = robot().starts()
     play.deaf.add("smooth")
-    play.tell(Said("smooth", "failed", {"operator": None, "when": "", "summary": "x", "where": "", "traceback": ""}))
+    play.tell(
+        Received("smooth", "failed", {"operator": None, "when": "", "summary": "x", "where": "", "traceback": ""})
+    )
 
     assert killed(play.wait(11.0)) == ["smooth"]
     assert play.core.status.notes[-1] == "process 'smooth' is back"
@@ -249,7 +251,7 @@ DROPS = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {queue:
 
 
 def stopped_for_a_while(consumer: str) -> Play:
-    """A run in which the consumer `sum` was stopped at stamp 100, and is heard again at 900."""
+    """A run in which the consumer `sum` was stopped at stamp 100, and reports again at 900."""
     play = Play(LEFT, consumer, OTHER, live=True).starts()
     play.wait(0.1)
     play.tell(play.progress("left", {"left": 100}))
@@ -285,7 +287,7 @@ def test_lossless_process_catches_up_before_sources_continue() -> None:
 def test_gap_at_a_consumer_is_counted_as_its_drops() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     gap = {"stream": "test/left/fast", "first": 10, "following": 15}
-    play.tell(play.progress("sum", {"sum": 9}), Said("sum", "gap", gap), play.progress("sum", {"sum": 20}))
+    play.tell(play.progress("sum", {"sum": 9}), Received("sum", "gap", gap), play.progress("sum", {"sum": 20}))
 
     assert play.core.status.drops["sum"] == {("x", "missed"): 5}
     assert play.core.status.operators["sum"].dropped == 5
@@ -303,7 +305,7 @@ def backlog_while_at_a_call(slow: str, *, seconds: float, done: int) -> tuple[Pl
     play.tell(play.progress("left", {"left": 1}))
     play.tell(play.progress("slow", {"slow": done}), play.progress("other", {"other": 100}))
     play.tell(play.progress("left", {"left": 1000}), play.beat("slow", ("slow", done + 1, seconds)))
-    return play, play.tell(Said("left", "backlog", {"messages": 50, "bytes": 2_000_000}))
+    return play, play.tell(Received("left", "backlog", {"messages": 50, "bytes": 2_000_000}))
 
 
 def test_hanging_operator_with_backlog_is_killed_and_restarted() -> None:
@@ -402,7 +404,7 @@ def test_endless_call_is_named_once_the_sources_have_ended() -> None:
     assert play.over is None  # sources may go on without it
 
     streams = play.plan.graph.nodes["left"].outputs.values()
-    play.tell(*(Said("left", "stream_ended", {"stream": s, "reason": "end of source"}) for s in streams))
+    play.tell(*(Received("left", "stream_ended", {"stream": s, "reason": "end of source"}) for s in streams))
     play.wait(20.0)
 
     assert play.failure().startswith("all sources have ended, and a call does not: process 'after', after at stamp 5")
@@ -423,8 +425,8 @@ def test_a_source_behind_the_clock_is_named_at_once_and_at_the_end() -> None:
     play = Play(LEFT, SUM, live=True, record="run.mcap").starts()
     play.wait(10.0)
     counts = {"left": [100, 100, 0, 9_000_000_000, 5]}
-    play.tell(Said("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [2.5, 2.5]}}))
-    play.tell(Said("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [3.5, 3.5]}}))
+    play.tell(Received("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [2.5, 2.5]}}))
+    play.tell(Received("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [3.5, 3.5]}}))
 
     told = "source 'left' has fallen behind the clock: reading it takes longer than real time"
     assert play.core.status.notes == [told]
@@ -437,14 +439,14 @@ def test_busy_process_is_named_as_the_cause_of_a_late_source() -> None:
     play = Play(LEFT, SUM, live=True, placement="one_process").starts()
     (label,) = play.processes
     counts = {"left": [1, 1, 0, 0, 5], "sum": [1, 1, 0, 0, 5]}
-    play.tell(Said(label, "progress", {"done": {}, "counts": counts, "behind": {"left": [0.1, 4.0]}}))
+    play.tell(Received(label, "progress", {"done": {}, "counts": counts, "behind": {"left": [0.1, 4.0]}}))
 
     assert play.core.status.notes == ["source 'left' has fallen behind the clock: its process is busy with sum"]
 
 
 def test_a_source_whose_stamps_jumped_far_ahead_is_named() -> None:
     play = Play(LEFT, SUM, live=True).starts()
-    play.tell(Said("left", "early", {"operator": "left", "last": 5, "stamp": 10**18, "seconds": 999_999_999.6}))
+    play.tell(Received("left", "early", {"operator": "left", "last": 5, "stamp": 10**18, "seconds": 999_999_999.6}))
 
     assert play.core.status.notes == [
         "source 'left' waits 31.7 years for the clock, its stamps jump from 5 to 1000000000000000000: "
@@ -496,7 +498,7 @@ def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() 
 
 
 def test_lost_records_are_resent_by_their_process_or_from_its_black_box() -> None:
-    play, lacks = robot(record="run.mcap").starts(), Said("@recorder", "lacks", {"operator": "smooth"})
+    play, lacks = robot(record="run.mcap").starts(), Received("@recorder", "lacks", {"operator": "smooth"})
     play.keeps(record("smooth", 0, 5))
     assert [(c.label, c.kind) for c in play.tell(lacks) if isinstance(c, Send)] == [("smooth", "lacks")]
 
@@ -511,7 +513,7 @@ def test_records_that_are_lacking_of_a_process_that_leaves_come_when_it_has_ende
     play.deaf.add("smooth")
     play.tell(play.ended("left"), play.ended("smooth"), play.ended("after"), play.ended("@recorder"))
     play.wait(0.2)
-    assert not sent(play.tell(Said("@recorder", "lacks", {"operator": "smooth"})), "records")
+    assert not sent(play.tell(Received("@recorder", "lacks", {"operator": "smooth"})), "records")
     play.dies("smooth", 0)
 
     assert [label for label, _ in sent(play.tell(), "records")] == ["@recorder"]
@@ -528,7 +530,7 @@ def test_a_process_that_died_again_at_once_does_not_use_an_incarnation_twice() -
 
 def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
     play = robot().starts()
-    play.tell(Died("smooth", -9), play.progress("smooth", {"smooth": FOREVER}), play.ended("smooth"), Tick())
+    play.tell(Exited("smooth", -9), play.progress("smooth", {"smooth": FOREVER}), play.ended("smooth"), Tick())
 
     assert play.over is None
 
@@ -561,7 +563,7 @@ def test_processes_behind_a_link_that_is_down_are_neither_silent_nor_started_aga
     assert not any(isinstance(command, Signal) for command in play.commands)
     assert not play.core.status.restarts
     assert [note for note in play.core.status.notes if "link" in note] == [
-        "the link to machine 'robot' is down: nothing of that machine is heard, and its operators go on",
+        "the link to machine 'robot' is down: that machine does not answer, and its operators go on",
         "the link to machine 'robot' is back",
     ]
     play.beating = False
@@ -585,11 +587,11 @@ def test_the_clock_of_another_machine_is_stored_now_and_then_and_shown_once() ->
 # -- what is counted and told of --------------------------------------------------------------------------------------
 
 
-def told(firings: int, dropped: int, timeouts: int) -> Said:
+def told(firings: int, dropped: int, timeouts: int) -> Received:
     """How far `smooth` is by its own count, which begins anew with its process."""
     counts = {"smooth": [firings, 2 * firings, dropped, 10 * firings, 5, 20 * firings]}
     drops, waits = {"smooth": [["x", "full", dropped]]}, {"smooth": [["x", "timeout", timeouts]]}
-    return Said("smooth", "progress", {"done": {}, "counts": counts, "drops": drops, "waits": waits})
+    return Received("smooth", "progress", {"done": {}, "counts": counts, "drops": drops, "waits": waits})
 
 
 def test_counts_of_an_operator_span_its_restarts() -> None:
@@ -610,7 +612,7 @@ def test_operators_recreated_within_their_process_are_counted() -> None:
     play = robot().starts()
     failed = {"when": "fire at stamp 5", "summary": "x", "pause": 0.5, "where": "", "traceback": ""}
     for name in ("smooth", "after", "smooth"):
-        play.tell(Said(name, "restarting", {"operator": name, **failed}))
+        play.tell(Received(name, "restarting", {"operator": name, **failed}))
     assert play.core.status.restarts == {"smooth": 2, "after": 1}
 
 
@@ -648,7 +650,7 @@ def test_cause_of_a_late_source_follows_from_its_times(
 def test_a_source_that_falls_behind_again_is_named_again() -> None:
     play = Play(LEFT, SUM, live=True).starts()
     for late in (0.9, 1.1, 0.6, 1.2, 0.4, 1.3):
-        play.tell(Said("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [late, late]}}))
+        play.tell(Received("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [late, late]}}))
     assert len(play.core.status.notes) == 2
     assert play.core.status.behind == {"left": 1.3}
 
@@ -657,7 +659,7 @@ def test_a_source_is_late_by_no_standstill_of_the_machine() -> None:
     play = Play(LEFT, SUM, live=True).starts()
 
     def late(read: float, sent: float) -> list[str]:
-        play.tell(Said("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [read, sent]}}))
+        play.tell(Received("left", "progress", {"done": {}, "counts": {}, "behind": {"left": [read, sent]}}))
         return [note for note in play.core.status.notes if "left" in note]
 
     late(0.0, 0.0)
@@ -679,11 +681,11 @@ def test_a_source_is_late_by_no_standstill_of_the_machine() -> None:
 def test_an_operator_that_takes_too_much_is_started_again_or_ends_the_run(policy: str, rule: str) -> None:
     limits = f"live: {{{policy}memory: 100MB, deadline: 2s}}"
     play = Play(LEFT, SUM[:-1] + f", {limits}}}", live=True).starts()
-    modest = Said("sum", "beat", {"memory": 100_000_000, "work": None})
+    modest = Received("sum", "beat", {"memory": 100_000_000, "work": None})
     assert killed(play.tell(modest)) == []
     broken = {
-        "memory": Said("sum", "beat", {"memory": 101_000_000, "work": None}),
-        "deadline": Said("sum", "overdue", {"operator": "sum", "stamp": 7, "seconds": 2.25}),
+        "memory": Received("sum", "beat", {"memory": 101_000_000, "work": None}),
+        "deadline": Received("sum", "overdue", {"operator": "sum", "stamp": 7, "seconds": 2.25}),
     }[rule]
     what = {
         "memory": "took 101 MB of memory (limit 100 MB)",
@@ -723,8 +725,8 @@ def test_the_time_before_a_restart_doubles() -> None:
 def test_restarted_process_gets_the_streams_that_ended_meanwhile() -> None:
     play = robot(record="run.mcap").starts()
     play.dies("smooth", -9)
-    play.tell(Said("left", "stream_ended", {"stream": "test/left/fast", "reason": "end of source"}))
-    play.tell(Said("left", "stream_ended", {"stream": "test/left/slow", "reason": "end of source"}))
+    play.tell(Received("left", "stream_ended", {"stream": "test/left/fast", "reason": "end of source"}))
+    play.tell(Received("left", "stream_ended", {"stream": "test/left/slow", "reason": "end of source"}))
     given = play.wait(0.3)
     over = {"streams": ["test/left/fast"], "reason": "end of source"}
     assert sent(given, "ended_elsewhere") == [("smooth", over)]
@@ -783,7 +785,7 @@ def test_only_the_last_records_of_the_dead_are_handed_over() -> None:
 def test_trigger_forwarded_by_several_processes_fires_once() -> None:
     play = robot(record="run.mcap").starts()
     for label, number in (("left", "a"), ("smooth", "a"), ("smooth", "b"), ("after", "a")):
-        play.tell(Said(label, "trigger", {"id": number, "text": f"bump {number}"}))
-    play.tell(TriggerAsked("button"))
+        play.tell(Received(label, "trigger", {"id": number, "text": f"bump {number}"}))
+    play.tell(TriggerRequested("button"))
     given = [fields["data"]["text"] for _, fields in sent(play.commands, "event") if fields["name"] == "trigger"]
     assert given == ["bump a", "bump b", "button"]

@@ -7,7 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plays import LEFT, SUM, Play
 
-from dataflow.supervision.core.events import Died, Event, HungUp, NotReading, Printed, Said, StopAsked, Tick
+from dataflow.supervision.core.events import (
+    Disconnected,
+    Event,
+    Exited,
+    NotReading,
+    Printed,
+    Received,
+    StopRequested,
+    Tick,
+)
 from dataflow.supervision.core.life import HAS_PROCESS, TRANSITIONS, Life, Step, after
 
 
@@ -60,9 +69,9 @@ def messages(label: str) -> st.SearchStrategy[Event]:
         ("lacks", {"operator": operator}),
     ]
     return st.one_of(
-        st.sampled_from([Said(label, kind, fields) for kind, fields in said]),
-        work.map(lambda at: Said(label, "beat", {"memory": 1, "work": at})),
-        st.sampled_from([HungUp(label), Printed(label, "…"), Died(label, -9), Died(label, None)]),
+        st.sampled_from([Received(label, kind, fields) for kind, fields in said]),
+        work.map(lambda at: Received(label, "beat", {"memory": 1, "work": at})),
+        st.sampled_from([Disconnected(label), Printed(label, "…"), Exited(label, -9), Exited(label, None)]),
         st.sampled_from([NotReading(label, 5.0, 3), NotReading(label, 5.0, 3, overflowed=True)]),
     )
 
@@ -70,7 +79,7 @@ def messages(label: str) -> st.SearchStrategy[Event]:
 anything = st.one_of(
     st.sampled_from(LABELS).flatmap(messages),
     st.just(Tick()),
-    st.just(StopAsked()),
+    st.just(StopRequested()),
     st.floats(0.05, 30.0),  # time passes
 )
 

@@ -18,8 +18,8 @@ from dataflow.supervision.configs import configurations
 from dataflow.supervision.plan import (
     FLIGHT_SETTLES,
     LogPlan,
-    Meeting,
     ProcessPlan,
+    Rendezvous,
     RunPlan,
     process_plans,
     replaced_in,
@@ -132,7 +132,7 @@ def test_log_of_an_inner_operator_keeps_its_upstream_for_others() -> None:
 
 def test_machines_and_environments_are_those_of_a_process_as_a_whole() -> None:
     text = GRAPH.replace("Sum, inputs: {x: smooth", "Sum, machine: arm, env: gpu, inputs: {x: smooth")
-    apart = RunPlan(load_text(text), placement="process_each", machines=Meeting("tcp/0.0.0.0:7447"))
+    apart = RunPlan(load_text(text), placement="process_each", machines=Rendezvous("tcp/0.0.0.0:7447"))
     found = process_plans(apart)
     assert {label: (p.machine, p.env) for label, p in found.items() if p.machine or p.env} == {"sum": ("arm", "gpu")}
     here = process_plans(RunPlan(load_text(text), placement="process_each"))
@@ -141,7 +141,7 @@ def test_machines_and_environments_are_those_of_a_process_as_a_whole() -> None:
     with pytest.raises(
         NetworkError, match=r"'both' would be on several machines \(arm, this one\): place its operators"
     ):
-        process_plans(RunPlan(load_text(text), placement=both, machines=Meeting("tcp/0.0.0.0:7447")))
+        process_plans(RunPlan(load_text(text), placement=both, machines=Rendezvous("tcp/0.0.0.0:7447")))
     with pytest.raises(EnvError, match=r"'both' would be in several environments \(gpu, this one\)"):
         process_plans(RunPlan(load_text(text), placement=both))
 

@@ -15,9 +15,9 @@ class Interrupted(Exception):
 
 def interrupted(at: int, steps: int = 1) -> Any:
     """A progress that stops the training in a step of an epoch."""
-    from operators.learning.loop import Silent
+    from operators.learning.loop import NoProgress
 
-    class Stopping(Silent):
+    class Stopping(NoProgress):
         left = steps
 
         def step(self, epoch: int, losses: object) -> None:

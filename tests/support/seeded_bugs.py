@@ -12,7 +12,7 @@ from pathlib import Path
 from zoo import bugs
 
 import dataflow
-from dataflow.capture.capture import Found, capture, write_test
+from dataflow.capture.capture import CaptureResult, capture, write_test
 from dataflow.debugging.debugger import Debugger
 from dataflow.graph import Graph, load_text
 from dataflow.recording import Recording
@@ -42,7 +42,7 @@ def recorded(case: bugs.Case, path: Path) -> Path:
     return path
 
 
-def captured(case: bugs.Case, path: Path, test: Path) -> tuple[Found, int, float]:
+def captured(case: bugs.Case, path: Path, test: Path) -> tuple[CaptureResult, int, float]:
     """Captures the bug; returns what was found, the bytes of its data, and seconds."""
     began = time.monotonic()
     with Recording(path) as recording:

@@ -13,7 +13,7 @@ from dataflow.graph import Graph
 from dataflow.messages import FeatureVector
 from dataflow.operator import In, Operator, Out, Param, Source
 from dataflow.sweep.plan import SweepError
-from dataflow.sweep.swap import Both, between, both, parts, shares
+from dataflow.sweep.swap import ReplayedPair, between, both, parts, shares
 
 FIGURE = "judge: mean error"
 STEPS = 12
@@ -65,7 +65,7 @@ def graph(left: float = 0.0, behind: float = 0.0, right: float = 0.0, seen: floa
     return made.connect("judge", left="behind/out", right="right/out").build()
 
 
-def compared(tmp_path: Path, changed: Graph) -> Both:
+def compared(tmp_path: Path, changed: Graph) -> ReplayedPair:
     recording = dataflow.run(graph(), record=tmp_path / "run.mcap").path
     assert recording is not None
     return both(recording, (graph(), changed), (), tmp_path)

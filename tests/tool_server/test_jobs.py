@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.tool_server import jobs as module
-from dataflow.tool_server.jobs import MOST_BYTES, Jobs, Refused, cut
+from dataflow.tool_server.jobs import MOST_BYTES, CallFailed, Jobs, cut
 
 BOUND = 60.0
 
@@ -44,9 +44,9 @@ def test_a_call_that_takes_longer_is_a_job_which_can_be_ended(hasty: Jobs, loud:
 
     hasty.job("1", cancel=True)
     hasty._soon = BOUND
-    with pytest.raises(Refused, match="job 1 was cancelled"):
+    with pytest.raises(CallFailed, match="job 1 was cancelled"):
         hasty.job("1")
-    with pytest.raises(Refused, match="no job '2'; there are: 1"):
+    with pytest.raises(CallFailed, match="no job '2'; there are: 1"):
         hasty.job("2")
     process = hasty._jobs["1"].process
     assert process is None or process.returncode is not None
@@ -58,7 +58,7 @@ def test_no_more_calls_wait_than_are_allowed(
     monkeypatch.setattr(module, "MOST_WAITING", 1)
     hasty.call("verify", {"recording": loud[0]})
 
-    with pytest.raises(Refused, match="1 jobs are not done: wait for one, or end one"):
+    with pytest.raises(CallFailed, match="1 jobs are not done: wait for one, or end one"):
         hasty.call("verify", {"recording": loud[0]})
 
 
@@ -68,7 +68,7 @@ def test_process_that_ends_without_answer_is_reported(patient: Jobs, tmp_path: P
     graph.write_text("graph: ends\noperators:\n  a: {use: 'ends:A'}\n")
     kept = Path(__file__).resolve().parent.parent / "recordings_of" / "run.mcap"
 
-    with pytest.raises(Refused, match=r"the process of verify ended without an answer \(3\): a last word"):
+    with pytest.raises(CallFailed, match=r"the process of verify ended without an answer \(3\): a last word"):
         patient.call("verify", {"recording": str(kept), "graph": str(graph), "path": [str(tmp_path)]})
 
 
@@ -85,5 +85,5 @@ def test_a_long_answer_is_given_in_parts_that_fit() -> None:
         parts.append(said)
         offset = int(rest.partition("offset=")[2].partition(")")[0])
     assert "".join(parts) == text
-    with pytest.raises(Refused, match="the answer of job 7 has"):
+    with pytest.raises(CallFailed, match="the answer of job 7 has"):
         cut(text, 10**6, "7")

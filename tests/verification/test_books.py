@@ -13,15 +13,15 @@ from dataflow.recording import RecordingError
 from dataflow.records.firing import CALLS, Emission, FiringRecord, encode_batch
 from dataflow.records.reading import FiringLog, whole
 from dataflow.sync import MessageRef
-from dataflow.verification.books import Books, Places
+from dataflow.verification.record_totals import GraphRecordTotals, MessageSet
 
 MIXED = Path(__file__).resolve().parent.parent / "runtime" / "mixed.yaml"
 numbers = st.integers(0, 3000) | st.integers(0, 12)
 places = st.lists(st.tuples(st.integers(0, 2), numbers), max_size=40)
 
 
-def places_of(found: list[tuple[int, int]]) -> Places:
-    made = Places()
+def places_of(found: list[tuple[int, int]]) -> MessageSet:
+    made = MessageSet()
     for place in found:
         made.add(*place)
     return made
@@ -68,7 +68,7 @@ def test_the_book_of_an_operator_is_that_of_all_its_records_wherever_they_lie(da
     kept = [record for record in records if data.draw(st.integers(0, 9))]
     laid = data.draw(st.permutations(kept + kept[:2])) if data.draw(st.booleans()) else kept
     graph = load_graph(MIXED)
-    books = Books(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), graph)
+    books = GraphRecordTotals(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), graph)
 
     book, (repeated, lost) = books.of("smooth"), whole(laid)
     assert book.lost == lost
@@ -90,12 +90,12 @@ def test_the_book_of_an_operator_is_that_of_all_its_records_wherever_they_lie(da
 def test_a_parameter_that_lies_before_the_finish_which_it_followed_does_not_hide_it() -> None:
     kinds = {2: "param", 0: "setup", 1: "finish"}
     laid = [FiringRecord("smooth", 0, index, kind, 0) for index, kind in kinds.items()]
-    books = Books(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), load_graph(MIXED))
+    books = GraphRecordTotals(FiringLog({"smooth": [encode_batch([r]) for r in laid]}, "run.mcap"), load_graph(MIXED))
     assert books.of("smooth").finished
 
 
 def test_an_error_does_not_grow_each_time_that_it_is_raised() -> None:
-    books = Books(FiringLog({"smooth": [b"no batch"]}, "run.mcap"), load_graph(MIXED))
+    books = GraphRecordTotals(FiringLog({"smooth": [b"no batch"]}, "run.mcap"), load_graph(MIXED))
     depths = []
     for _ in range(3):
         with pytest.raises(RecordingError, match="damaged") as found:

@@ -11,7 +11,7 @@ import pytest
 
 from dataflow.process.polling import readable
 from dataflow.supervision.core.report import RunFailed
-from dataflow.verification.workers.prestart import EarlyWorkers, Started, early_workers
+from dataflow.verification.workers.prestart import EarlyWorkers, PrestartedWorker, early_workers
 from dataflow.verification.workers.processes import Call, call_workers
 
 
@@ -58,7 +58,7 @@ def test_early_workers_that_are_not_taken_are_ended() -> None:
         workers = EarlyWorkers(2)
         if wait:
             taken = workers.take(1)
-            assert isinstance(taken, Started)
+            assert isinstance(taken, PrestartedWorker)
             assert taken.pid in children()
             taken.end()
         workers.close()

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix
-from dataflow.view.frames import Attach, Detach, FrameCycleError, FrameTree, NewRoot, Rank
+from dataflow.view.frames import Attach, Detach, FrameCycleError, FramePriority, FrameTree, NewRoot
 
 
 def T(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
@@ -16,7 +16,13 @@ def T(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
 
 
 def place(
-    tree: FrameTree, parent: str, child: str, pose: np.ndarray, owner: str = "tf", rank: Rank = Rank.TREE, t: int = 0
+    tree: FrameTree,
+    parent: str,
+    child: str,
+    pose: np.ndarray,
+    owner: str = "tf",
+    rank: FramePriority = FramePriority.TREE,
+    t: int = 0,
 ):
     return tree.place(parent, child, pose, owner=owner, rank=rank, stamp=t)
 
@@ -68,13 +74,16 @@ def test_a_cycle_of_given_poses_is_refused_with_its_frames() -> None:
 def test_an_estimate_places_the_camera_and_the_truth_is_aligned_with_it(truth_first: bool) -> None:
     tree = FrameTree()
     T_world_camera, T_odom_camera = T(5.0, -1.0, 0.7), T(0.1, 0.0, 0.1)
-    poses = [("world", T_world_camera, "truth", Rank.TRUTH), ("odom", T_odom_camera, "vo", Rank.ESTIMATE)]
+    poses = [
+        ("world", T_world_camera, "truth", FramePriority.TRUTH),
+        ("odom", T_odom_camera, "vo", FramePriority.ESTIMATE),
+    ]
     for parent, pose, owner, rank in poses if truth_first else poses[::-1]:
         place(tree, parent, "camera", pose, owner, rank)
     assert tree.root == "world"
     np.testing.assert_allclose(tree.pose("odom"), T_world_camera @ invert(T_odom_camera), atol=1e-12)
-    place(tree, "world", "camera", T(9, 9), "truth", Rank.TRUTH, 1)
-    place(tree, "odom", "camera", T(1, 0), "vo", Rank.ESTIMATE, 1)
+    place(tree, "world", "camera", T(9, 9), "truth", FramePriority.TRUTH, 1)
+    place(tree, "odom", "camera", T(1, 0), "vo", FramePriority.ESTIMATE, 1)
     expected = T_world_camera @ invert(T_odom_camera) @ T(1, 0)
     np.testing.assert_allclose(tree.pose("camera"), expected, atol=1e-12)  # aligned once, then the estimate alone
 
@@ -82,8 +91,8 @@ def test_an_estimate_places_the_camera_and_the_truth_is_aligned_with_it(truth_fi
 def test_streams_are_aligned_at_equal_stamps() -> None:
     tree = FrameTree()
     for t in range(5):
-        place(tree, "world", "camera", T(t, 0.0), "truth", Rank.TRUTH, t)
-    place(tree, "odom", "camera", T(0.0, 0.0), "vo", Rank.ESTIMATE, 2)
+        place(tree, "world", "camera", T(t, 0.0), "truth", FramePriority.TRUTH, t)
+    place(tree, "odom", "camera", T(0.0, 0.0), "vo", FramePriority.ESTIMATE, 2)
     np.testing.assert_allclose(tree.pose("odom"), T(2.0, 0.0), atol=1e-12)
 
 
@@ -93,7 +102,8 @@ FRAMES = st.sampled_from(["map", "odom", "base", "camera", "lidar", "imu"])
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(
-        st.tuples(FRAMES, FRAMES, st.integers(-3, 3), st.sampled_from(list(Rank)), st.sampled_from("xyz")), max_size=25
+        st.tuples(FRAMES, FRAMES, st.integers(-3, 3), st.sampled_from(list(FramePriority)), st.sampled_from("xyz")),
+        max_size=25,
     )
 )
 def test_everything_hangs_under_one_root_and_the_changes_rebuild_the_tree(events: list) -> None:
@@ -125,8 +135,8 @@ def test_everything_hangs_under_one_root_and_the_changes_rebuild_the_tree(events
 def test_a_pose_of_a_stamp_is_that_of_then_and_of_no_other_time() -> None:
     tree = FrameTree()
     place(tree, "base", "camera", T(0.5, 0.0))
-    place(tree, "odom", "base", T(1.0, 0.0), owner="odometry", rank=Rank.ESTIMATE, t=10)
-    place(tree, "odom", "base", T(2.0, 0.0), owner="odometry", rank=Rank.ESTIMATE, t=20)
+    place(tree, "odom", "base", T(1.0, 0.0), owner="odometry", rank=FramePriority.ESTIMATE, t=10)
+    place(tree, "odom", "base", T(2.0, 0.0), owner="odometry", rank=FramePriority.ESTIMATE, t=20)
     np.testing.assert_allclose(tree.pose_at("camera", 10), T(1.5, 0.0))
     np.testing.assert_allclose(tree.pose_at("camera", 20), T(2.5, 0.0))
     assert tree.pose_at("camera", 30) is None, "it has moved on, and nobody has said where to"

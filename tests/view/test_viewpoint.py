@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from dataflow.view.frames import Rank
-from dataflow.view.viewpoint import Outlook
+from dataflow.view.frames import FramePriority
+from dataflow.view.viewpoint import ViewerPose
 
 if TYPE_CHECKING:  # imported before the first of these tests runs (tests/conftest.py)
     from dataflow.view.scene import SceneState
 
 
-def in_image(looked: Outlook, points: np.ndarray) -> np.ndarray:
+def in_image(looked: ViewerPose, points: np.ndarray) -> np.ndarray:
     """Where points are in a view of 50 degrees that is 1.2 times as wide as high: its edges are at -1 and 1."""
     assert looked.position is not None
     assert looked.target is not None
@@ -27,11 +27,11 @@ def in_image(looked: Outlook, points: np.ndarray) -> np.ndarray:
     return np.where(depth > 0, np.array([x / depth / (1.2 * half), y / depth / half]), np.inf)
 
 
-def in_view(looked: Outlook, points: np.ndarray) -> bool:
+def in_view(looked: ViewerPose, points: np.ndarray) -> bool:
     return bool(np.abs(in_image(looked, points)).max() < 1)
 
 
-def fills(looked: Outlook, points: np.ndarray) -> float:
+def fills(looked: ViewerPose, points: np.ndarray) -> float:
     """The larger share of the view's width and height that points take up."""
     return float(np.ptp(in_image(looked, points), axis=1).max() / 2)
 
@@ -43,7 +43,7 @@ def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
     around, before = SceneState(), SceneState()
     for scene, points in ((around, room - [1, 0, 0]), (before, ahead)):
         scene.tree.place("world", "lidar", np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-                         owner="r/base", rank=Rank.TREE, stamp=0)  # fmt: skip
+                         owner="r/base", rank=FramePriority.TREE, stamp=0)  # fmt: skip
         scene.viewpoint.saw_points(scene.tree.pose("lidar"), points)
 
     looked = around.viewpoint.outlook(around.tree)
@@ -63,7 +63,7 @@ def test_the_whole_way_of_a_run_without_ranges_is_in_view_when_it_is_over() -> N
     for x in np.linspace(0, 40, 5000):
         scene.viewpoint.saw_places(away, [x, 4 * np.sin(x), 0])
     scene.viewpoint.posed.setdefault("base")
-    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=Rank.TREE, stamp=0)
+    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=FramePriority.TREE, stamp=0)
     assert scene.viewpoint.knows_more
 
     begun = scene.viewpoint.outlook(scene.tree)
@@ -83,7 +83,7 @@ def test_viewpoint_covers_the_trajectory_and_the_last_camera_view(far: float) ->
     ahead = np.stack(np.meshgrid([2.0 * far, 3.0 * far], np.linspace(-far, far, 9), np.linspace(-0.3, far, 9)), -1)
     for x in np.linspace(0, 3, 40):
         shift[0, 3] = x
-        scene.tree.place("world", "camera", shift, owner="r/camera", rank=Rank.TREE, stamp=round(1e9 * x))
+        scene.tree.place("world", "camera", shift, owner="r/camera", rank=FramePriority.TREE, stamp=round(1e9 * x))
         scene.viewpoint.saw_places(np.eye(4), [x, 0, 0])
         scene.viewpoint.saw_points(scene.tree.pose("camera"), ahead.reshape(-1, 3))
     scene.viewpoint.posed.setdefault("camera")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import RECORDED, CodeOptions
 from dataflow.cli.support.arguments import Json, RecordingFile, existing_recording, number, span
 from dataflow.cli.support.options import option
 from dataflow.cli.support.output import count, err, fail, out, plural, print_json, seconds, table
+from dataflow.cli.support.repeated_calls import RECORDED, CodeOptions
 
 if TYPE_CHECKING:
     from dataflow.blame.field import Field

@@ -12,10 +12,10 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.commands.sweep import AS_USUAL, Recordings, WorkOptions, print_torn, torn_of, work
-from dataflow.cli.support.again import take_environment
 from dataflow.cli.support.arguments import Json, Overwrite, find_modules_in, graph_file, output_file
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import count, fail, out, plural, print_json, table
+from dataflow.cli.support.repeated_calls import take_environment
 from dataflow.cli.support.report import is_score
 from dataflow.cli.support.run_options import Quiet, Verbose
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from dataflow.sweep.paired import Difference, Paired
     from dataflow.sweep.plan import Choice
     from dataflow.sweep.run import Sweep
-    from dataflow.sweep.swap import Both, Share
+    from dataflow.sweep.swap import OperatorShare, ReplayedPair
 
 MOST_NAMED = 5
 """Recordings listed."""
@@ -145,7 +145,7 @@ def _named(name: str | None, figures: Sequence[Paired]) -> Paired:
     return found[0]
 
 
-def _both(plan: Sweep, name: str, folder: str) -> Both:
+def _both(plan: Sweep, name: str, folder: str) -> ReplayedPair:
     """A recording by A and by B, with every stream."""
     from dataflow.sweep.plan import SweepError
     from dataflow.sweep.swap import both
@@ -159,7 +159,7 @@ def _both(plan: Sweep, name: str, folder: str) -> Both:
     return both(Path(where), (a, b), plan.maps, Path(folder))
 
 
-def _explained(plan: Sweep, figure: Paired, different: Sequence[Difference]) -> list[Share]:
+def _explained(plan: Sweep, figure: Paired, different: Sequence[Difference]) -> list[OperatorShare]:
     from dataflow.sweep.swap import between, parts, shares
 
     made = []
@@ -185,7 +185,7 @@ def _report(
     figures: Sequence[Paired],
     shown: Sequence[Paired],
     different: Sequence[Difference],
-    shares: Sequence[Share] | None,
+    shares: Sequence[OperatorShare] | None,
     copies: Mapping[str, str],
     *,
     json: bool,
@@ -296,7 +296,7 @@ def _print_left_out(copies: Mapping[str, str], torn: Sequence[str]) -> None:
     print_torn(torn)
 
 
-def _print_shares(shares: Sequence[Share]) -> None:
+def _print_shares(shares: Sequence[OperatorShare]) -> None:
     made = table("its outputs as in B, all else A", "change", "of B - A", right=("change", "of B - A"))
     for one in shares:
         made.add_row(Text(one.operator), f"{one.change:+.3g}", f"{one.share:.0%}")

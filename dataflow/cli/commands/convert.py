@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dataflow.interop.account import Account
     from dataflow.interop.export.report import Exported
     from dataflow.interop.export.source import ExportSource
-    from dataflow.interop.playing import Wishes
+    from dataflow.interop.playing import BagReadOptions
 
 Format = Literal[
     "mcap",
@@ -135,9 +135,9 @@ def convert(
 
 
 def _convert(recording: Path, output: Path, to: Format, scales: dict[str, float], options: ConvertOptions) -> None:
-    from dataflow.interop.playing import Wishes
+    from dataflow.interop.playing import BagReadOptions
 
-    wishes = Wishes(scales, lossy=options.lossy, strict=options.strict)
+    wishes = BagReadOptions(scales, lossy=options.lossy, strict=options.strict)
     if not to.startswith("lerobot") and (options.action is not None or options.task):
         raise fail("--action and --task are of --to lerobot and lerobot-v3")
     with (
@@ -258,7 +258,7 @@ def _complete(output: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _opened(path: Path, asked: Selection, wishes: Wishes) -> Iterator[ExportSource]:
+def _opened(path: Path, asked: Selection, wishes: BagReadOptions) -> Iterator[ExportSource]:
     from dataflow.interop.export.source import ExportSource
     from dataflow.recording.layout import RECORDING
     from dataflow.recording.streams.cutting import cut_of

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from dataflow.cli.support.again import CodeOptions
 from dataflow.cli.support.arguments import Json, RecordingFile, existing_recording, number, output_file, span
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import DIFFERENT, fail, out, plural, print_json, size
+from dataflow.cli.support.repeated_calls import CodeOptions
 from dataflow.cli.support.run_options import MakeEffects
 
 EDITOR_COMES = 3600.0

@@ -29,7 +29,7 @@ from dataflow.cli.support.output import count, fail, out, plural, print_json, sa
 from dataflow.cli.support.quantities import parsed_duration, parsed_size
 
 if TYPE_CHECKING:
-    from dataflow.editing.report import Edited
+    from dataflow.editing.report import WrittenFile
 
 
 def cut(
@@ -169,7 +169,7 @@ def split(
     fail_if_lost(done)
 
 
-def _print_parts(done: Sequence[Edited], target: Path) -> None:
+def _print_parts(done: Sequence[WrittenFile], target: Path) -> None:
     made = table("part", "begins", "lasts", "messages", "size", right=("begins", "lasts", "messages", "size"))
     first = next((one.span[0] for one in done if one.span is not None), 0)
     for one in done:

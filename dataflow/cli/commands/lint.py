@@ -15,8 +15,8 @@ from dataflow.cli.support.options import option
 from dataflow.cli.support.output import DIFFERENT, count, out, plural, print_json, shown, table
 
 if TYPE_CHECKING:
+    from dataflow.lint.checks import Report
     from dataflow.lint.inputs import LintInput
-    from dataflow.lint.look import Report
 
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -37,7 +37,7 @@ def lint(
 
     Gaps, timestamps that repeat or go back, rates, streams that begin late or end early, frames that hang on nothing or
     have two parents. Clocks: gyroscopes, wheels, odometry, poses and images all show how the robot turns; where their
-    timestamps do not fit, the offset is told with its sign (+: the timestamps are late) and how it drifts. The clock
+    timestamps do not fit, the offset is reported with its sign (+: the timestamps are late) and its drift. The clock
     that most streams have is taken for right, unless the contract names one.
 
     Exit codes:
@@ -53,8 +53,8 @@ def lint(
       dataflow lint run.mcap --contract robot.yaml --json
       dataflow lint rosbag2_folder --quick
     """
+    from dataflow.lint.checks import lint as look
     from dataflow.lint.contract import load_contract, proposed
-    from dataflow.lint.look import lint as look
 
     if write is not None:
         output_file(write, ".yaml", overwrite=overwrite, option="--write-contract")

@@ -51,7 +51,7 @@ def join(
 
 
 def new(folder: Annotated[Path, argument("FOLDER", "The folder to make.")]) -> None:
-    """Make an authority, which issues keys. Its folder stays where it is: who has it can issue keys.
+    """Make an authority, which issues keys. Its folder stays where it is: its owner can issue keys.
 
     Examples:
 

@@ -16,7 +16,7 @@ from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import count, fail, out, plural, print_json, say, shown, size, table
 
 if TYPE_CHECKING:
-    from dataflow.editing.recover import Recovered
+    from dataflow.editing.recover import RecoveryReport
 
 
 def merge(
@@ -137,7 +137,7 @@ def recover(
         raise typer.Exit(DIFFERENT)
 
 
-def _print_recovered(done: Recovered, recording: Path, output: Path) -> None:
+def _print_recovered(done: RecoveryReport, recording: Path, output: Path) -> None:
     lost = {loss.stream: loss.messages for loss in done.lost}
     made = table("stream", "saved", "lost", right=("saved", "lost"))
     for name in sorted(done.saved.streams.keys() | lost):

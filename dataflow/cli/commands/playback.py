@@ -36,19 +36,19 @@ KEYS: dict[bytes, Pressed] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class KeyBindings:
     """Keys that act on a run, and the help that its terminal shows for them."""
 
     help: str
     does: frozenset[Pressed]
 
 
-PLAYING = Offer(
+PLAYING = KeyBindings(
     "space: pause and go on · → or n: one step · + and -: twice and half as fast",
     frozenset({"toggle", "step", "faster", "slower"}),
 )
-KEEPING = Offer("k: save the history", frozenset({"keep"}))
-ENDING = Offer("q: end", frozenset({"quit"}))
+KEEPING = KeyBindings("k: save the history", frozenset({"keep"}))
+ENDING = KeyBindings("q: end", frozenset({"quit"}))
 ACTIONS = ("pause", "resume", "step", "speed", "status")
 
 
@@ -84,7 +84,7 @@ def _in_foreground(terminal: int) -> bool:
 
 
 @contextmanager
-def _steered(offers: Sequence[Offer], supervisor: Supervisor) -> Iterator[None]:
+def _steered(offers: Sequence[KeyBindings], supervisor: Supervisor) -> Iterator[None]:
     """Reads keys on a separate thread while a run lasts; restores the terminal afterwards."""
     import termios
     import tty

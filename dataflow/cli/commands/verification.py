@@ -12,16 +12,16 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.support.again import CodeOptions
 from dataflow.cli.support.arguments import Json, check_offset, existing, offset, output_file
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import COULD_NOT_RUN, DIFFERENT, err, fail, out, own_traceback, print_json, say
+from dataflow.cli.support.repeated_calls import CodeOptions
 from dataflow.cli.support.run_options import MakeEffects, Paranoid, Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dataflow.causes.why import Why
+    from dataflow.causes.why import CauseReport
     from dataflow.graph import Graph
     from dataflow.verification.gate import Baseline, Checked
     from dataflow.verification.report import VerifyReport
@@ -207,7 +207,9 @@ def _verifier(graph: Graph | None, early: EarlyWorkers, options: VerifyOptions) 
     return verifier
 
 
-def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None, *, quiet: bool = False) -> list[Why]:
+def _reasons(
+    checked: Checked, only: list[str] | None, graph: Graph | None, *, quiet: bool = False
+) -> list[CauseReport]:
     from dataflow.causes.ladder import MOST
     from dataflow.causes.why import reasons
 
@@ -227,7 +229,7 @@ def _reasons(checked: Checked, only: list[str] | None, graph: Graph | None, *, q
         return reasons(checked.path, checked.report, only or (), graph, progress)
 
 
-def _report(checked: list[Checked], reasons: list[list[Why]], options: VerifyOptions, *, single: bool) -> None:
+def _report(checked: list[Checked], reasons: list[list[CauseReport]], options: VerifyOptions, *, single: bool) -> None:
     from dataflow.cli.support.causes import print_reasons
     from dataflow.cli.support.verdicts import print_many, print_one
 
@@ -261,7 +263,7 @@ def _report(checked: list[Checked], reasons: list[list[Why]], options: VerifyOpt
         write_junit(options.junit, checked)
 
 
-def _may_be_a_test(report: VerifyReport, operator: str, reasons: list[list[Why]]) -> bool:
+def _may_be_a_test(report: VerifyReport, operator: str, reasons: list[list[CauseReport]]) -> bool:
     """Returns whether a call of an operator that differs can be a test: it differs alike each time, and not by chance.
 
     One that is as it was recorded depends on something else: without the reasons it is not known whether that stays.

@@ -23,7 +23,15 @@ from dataflow.cli.support.arguments import (
     existing_recording,
     output_file,
 )
-from dataflow.cli.support.drawing import Announcer, Drawn, draw_recording, open_sink, report, showing, until_interrupted
+from dataflow.cli.support.drawing import (
+    Announcer,
+    DrawingResult,
+    draw_recording,
+    open_sink,
+    report,
+    showing,
+    until_interrupted,
+)
 from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import fail, say
 from dataflow.cli.support.viewers import require_display
@@ -137,7 +145,7 @@ def _view_running(
                 say("the graph has ended; still serving until Ctrl-C")
                 until_interrupted()
             complete = sink.close(timeout=60.0)
-    report(Drawn(sink, complete, Account()))
+    report(DrawingResult(sink, complete, Account()))
 
 
 def _draw_running(

@@ -50,7 +50,7 @@ def replay_bag(
     began: float,
 ) -> None:
     """Replays a bag through a graph; prints which topics are played, by which clock, and what was repaired."""
-    from dataflow.editing.untouched import keep_untouched
+    from dataflow.editing.unmapped_topics import keep_untouched
     from dataflow.interop.playing import match
     from dataflow.interop.streams import BagStreams
     from dataflow.recording.layout import BAG

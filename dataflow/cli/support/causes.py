@@ -24,7 +24,7 @@ from dataflow.causes.sources import (
     WALL,
     kind_of,
 )
-from dataflow.causes.why import Cause, Why
+from dataflow.causes.why import Cause, CauseReport
 from dataflow.cli.support.output import count, plural, seconds, table
 
 OUTSIDE = "files that C libraries read, files that are gone, devices, services"
@@ -56,7 +56,7 @@ def as_recorded(*, code_known: bool) -> str:
     )
 
 
-def print_reasons(console: Console, recording: str, reasons: Sequence[Why]) -> None:
+def print_reasons(console: Console, recording: str, reasons: Sequence[CauseReport]) -> None:
     """A table of all causes, then a line for each operator about what was tried."""
     causes = table("operator", "depends on", "where", "calls", "instead", right=("calls",))
     for found in reasons:
@@ -75,7 +75,7 @@ def print_reasons(console: Console, recording: str, reasons: Sequence[Why]) -> N
             console.print(Text(line), soft_wrap=True)
 
 
-def _lines(found: Why) -> Iterator[str]:
+def _lines(found: CauseReport) -> Iterator[str]:
     if found.refused:
         yield f"{found.operator}: no cause looked for: {found.refused}"
         return
@@ -104,7 +104,7 @@ def _lines_of(cause: Cause) -> str:
     return ", ".join(f"{Path(site.file).name}:{site.line}" for site in cause.sites)
 
 
-def _outcome(found: Why) -> str:
+def _outcome(found: CauseReport) -> str:
     if found.repeats and found.changed and found.causes:
         return "it repeats here; besides the causes above, this is not as it was recorded"
     if found.causes:

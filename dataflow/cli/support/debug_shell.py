@@ -22,8 +22,8 @@ from dataflow.messages.display.text import field_text
 from dataflow.sync.entries import entries_of
 
 if TYPE_CHECKING:
-    from dataflow.debugging.debugger import Debugger, Unmade
-    from dataflow.debugging.fired import Fired
+    from dataflow.debugging.debugger import Debugger, UnrepeatableCalls
+    from dataflow.debugging.fired import RepeatedCall
     from dataflow.view import ViewerSink
 
 MOST_FIELDS = 8
@@ -89,7 +89,7 @@ class Shell(cmd.Cmd):
         lacking: list[str] = []
         looked_at = 0
 
-        def is_so(fired: Fired) -> bool:
+        def is_so(fired: RepeatedCall) -> bool:
             nonlocal looked_at
             try:
                 found = bool(eval(code, fired.names()))
@@ -201,13 +201,13 @@ class Shell(cmd.Cmd):
         """Does the command of a line. An error is printed, and the loop goes on."""
         from dataflow.execution.failure import OperatorFailure
         from dataflow.recording import RecordingError
-        from dataflow.reexecution.engine import Stuck
+        from dataflow.reexecution.engine import ReexecutionStalled
         from dataflow.reexecution.recorded_run import ReplayError
 
         self.failed = False
         try:
             return bool(super().onecmd(line))
-        except (WrongCommand, ReplayError, RecordingError, OperatorFailure, Stuck) as error:
+        except (WrongCommand, ReplayError, RecordingError, OperatorFailure, ReexecutionStalled) as error:
             self.failed = True
             out.print(Text.assemble(("error: ", "bold red"), str(error)), soft_wrap=True)
         except KeyboardInterrupt:
@@ -271,12 +271,12 @@ class Shell(cmd.Cmd):
     def _here(self) -> int:
         return -1 if self._debugger.at is None else self._debugger.at.number
 
-    def _fired(self) -> Fired:
+    def _fired(self) -> RepeatedCall:
         if self._debugger.at is None:
             raise WrongCommand("no call was made yet: goto one")
         return self._debugger.at
 
-    def _show(self, fired: Fired, unmade: Unmade | None = None) -> None:
+    def _show(self, fired: RepeatedCall, unmade: UnrepeatableCalls | None = None) -> None:
         """Shows a call. `unmade`: calls that the search for it has passed by, of which one may be meant as well."""
         if self._json:
             more = {} if unmade is None else {"not_made": asdict(unmade)}
@@ -292,7 +292,7 @@ class Shell(cmd.Cmd):
             for stream, message in chain(((entry.stream, entry.value) for entry in given), made):
                 self._viewer.log(stream, message)
 
-    def lines(self, fired: Fired) -> Iterator[Text]:
+    def lines(self, fired: RepeatedCall) -> Iterator[Text]:
         """A call in some lines: when it was, what was given, what came out, what it changed."""
         of = f"call {fired.number} of {len(self._debugger.calls)}"
         when = (fired.call.stamp - self._origin) * 1e-9

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class DrawingResult:
     """The viewer, closed; whether it took everything; and what there is to say of a bag."""
 
     sink: ViewerSink
@@ -36,7 +36,7 @@ class Drawn:
 
 def draw_recording(
     path: Path, target: Target, asked: Selection, every: float | None = None, *, strict: bool = False
-) -> Drawn:
+) -> DrawingResult:
     """Draws a recording or a bag. `strict`: what cannot be read of a bag is an error, else it is counted."""
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -82,7 +82,7 @@ def draw_recording(
                 until_interrupted()
             complete = sink.close(timeout=60.0)
         say_account(opened, known)
-        return Drawn(sink, complete, account_of(opened))
+        return DrawingResult(sink, complete, account_of(opened))
 
 
 def opened_streams(path: Path, clock: Choice, *, strict: bool = False) -> Recording | BagStreams:
@@ -93,10 +93,10 @@ def opened_streams(path: Path, clock: Choice, *, strict: bool = False) -> Record
     if not is_foreign(path):
         refuse_of_recording(path, clock, strict=strict)
         return Recording(path)
-    from dataflow.interop.playing import Wishes, readable
+    from dataflow.interop.playing import BagReadOptions, readable
 
     with closing(open_bag(path, strict=strict)) as bag:
-        streams = readable(bag, path, clock, wishes=Wishes(strict=strict))
+        streams = readable(bag, path, clock, wishes=BagReadOptions(strict=strict))
     say(f"[dim]stamps: {escape(streams.clock.kind)}: {escape(streams.clock.why)}[/]")
     say_account(streams)
     return streams
@@ -177,7 +177,7 @@ class Announcer:
         return announced
 
 
-def report(done: Drawn, file: Path | None = None) -> None:
+def report(done: DrawingResult, file: Path | None = None) -> None:
     """Prints how much was drawn, and where it is: in `file`, if it was moved there."""
     from dataflow.view import Save
 

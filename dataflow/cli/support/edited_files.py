@@ -18,7 +18,7 @@ from dataflow.cli.support.output import DIFFERENT, count, err, fail, out, plural
 from dataflow.cli.support.quantities import parsed_duration, parsed_moment
 
 if TYPE_CHECKING:
-    from dataflow.editing.report import Edited
+    from dataflow.editing.report import WrittenFile
     from dataflow.recording.streams.copying import Origin
 
 EditedFile = Annotated[Path, argument("RECORDING", "A recording, or any other MCAP file.")]
@@ -104,7 +104,7 @@ def copying(what: str, hidden: bool) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
-def tell_edited(done: Edited, *, json: bool) -> None:
+def tell_edited(done: WrittenFile, *, json: bool) -> None:
     """Prints what was written; the exit code is 1 where something of it is lost."""
     if json:
         print_json(done.as_json())
@@ -113,13 +113,13 @@ def tell_edited(done: Edited, *, json: bool) -> None:
     fail_if_lost([done])
 
 
-def fail_if_lost(done: Iterable[Edited]) -> None:
+def fail_if_lost(done: Iterable[WrittenFile]) -> None:
     """The exit code is 1 where a file that was written lacks messages, or may lack some."""
     if any(one.lost or one.lacking for one in done):
         raise typer.Exit(DIFFERENT)
 
 
-def _print_edited(done: Edited) -> None:
+def _print_edited(done: WrittenFile) -> None:
     made = table("stream", "messages", right=("messages",))
     for name, number in done.streams.items():
         made.add_row(Text(name), count(number))

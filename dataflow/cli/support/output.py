@@ -163,16 +163,16 @@ def interrupted_by_user(error: BaseException | None) -> bool:
 
 _KNOWN = {
     *("BaselineError", "BusError", "ChaosError", "ContractError", "EnvError", "FoxgloveError", "KeysError"),
-    *("MappingError", "MessageError", "NameFault", "NetworkError", "NotRunning", "OperatorImportError"),
+    *("MappingError", "MessageError", "InvalidName", "NetworkError", "NotRunning", "OperatorImportError"),
     *("ParameterError", "RecordingError", "RegistryError", "ReplayError", "SweepError", "ViewerError", "WrongCommand"),
 }
-"""Errors of this package whose messages tell users what they can do."""
+"""Errors of this package whose messages name the remedy."""
 
 
 def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
-    from dataflow.client.attach import Lost
-    from dataflow.client.processes import NoAnswer, Refused
+    from dataflow.client.attach import MachineUnreachable
+    from dataflow.client.processes import NoAnswer, RequestRejected
     from dataflow.execution.failure import OperatorFailure
     from dataflow.graph import GraphError
     from dataflow.supervision.core.report import RunFailed
@@ -186,7 +186,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
                 details = ""  # the message names the file; where in the operator it was opened does not help
             message = "\n".join((str(error), *getattr(error, "__notes__", ())))
             return message, details, INTERRUPTED if error.interrupted else DIFFERENT
-        case Lost() | NoAnswer() | Refused():
+        case MachineUnreachable() | NoAnswer() | RequestRejected():
             return str(error), "", DIFFERENT
         case OperatorFailure():  # of calls that are made again
             return str(error), error.traceback, COULD_NOT_RUN

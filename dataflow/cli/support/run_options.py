@@ -117,7 +117,7 @@ def machines_of(
 ) -> dict[str, Any]:
     """Returns the field of a `RunPlan` for other machines, if an option is about them; a run listens."""
     from dataflow.machines.keys import require_address, require_serving, settings
-    from dataflow.supervision.plan import Meeting
+    from dataflow.supervision.plan import Rendezvous
 
     if here and listen is not None:
         raise fail("--here runs everything on this machine; --listen is for others")
@@ -131,4 +131,4 @@ def machines_of(
         require_serving(keys)
         if begins and not here and listen is not None:
             require_address(listen)
-    return {"machines": Meeting(listen, keys)} if listen is not None else {"machines": None} if here else {}
+    return {"machines": Rendezvous(listen, keys)} if listen is not None else {"machines": None} if here else {}

@@ -1,4 +1,4 @@
-"""Standard output whose failure is told from that of any other file; the console script replaces Python's by it."""
+"""Standard output whose failure differs from that of any other file; the console script replaces Python's by it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class OutputFailed(OSError):
 
 
 class Output(io.TextIOWrapper):
-    """Standard output, whose failure is told from that of any other file."""
+    """Standard output, whose failure differs from that of any other file."""
 
     def write(self, text: str) -> int:
         try:

@@ -63,7 +63,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The graph at one moment: its operators, the sources behind the clock with who holds each up, the notes of
+    """The graph at one moment: its operators, the sources behind the clock with what holds each up, the notes of
     operators, the latencies of its paths, the other machines."""
 
     rows: Sequence[Row]
@@ -134,7 +134,7 @@ def _lags(counts: Mapping[str, Sequence[int]]) -> dict[str, float | None]:
 
 
 def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dict[str, str]:
-    """Names the sources that are behind the clock, and who holds each up."""
+    """Names the sources that are behind the clock, and what holds each up."""
     said = {}
     for row in rows:
         if row.behind_clock is None or row.behind_clock <= LATE or row.state == "ended":

@@ -21,10 +21,10 @@ from types import CodeType, FrameType, SimpleNamespace
 from typing import Any
 
 from dataflow.debugging.dap.variables import Variables
-from dataflow.debugging.dap.wire import Gone, Wire
+from dataflow.debugging.dap.wire import EditorDisconnected, Wire
 from dataflow.debugging.debugger import DebugError, Debugger
-from dataflow.debugging.fired import Abandoned, Fired, Process, Through
-from dataflow.debugging.lines import Lines, Spot, homes_of, is_own, own_frames, stoppable_line
+from dataflow.debugging.fired import Abandoned, Process, RepeatedCall, Through
+from dataflow.debugging.lines import CodePosition, Lines, homes_of, is_own, own_frames, stoppable_line
 from dataflow.execution.failure import OperatorFailure, readable
 from dataflow.messages.base import Message
 from dataflow.reexecution.recorded_run import ReplayError
@@ -65,7 +65,7 @@ class Breakpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Going:
+class StopTarget:
     """The next call to be made, and where in it to stop; `line`: the number of the line event there, if it is known."""
 
     call: int
@@ -81,7 +81,7 @@ class Session:
     ) -> None:
         connection.settimeout(GREETS)
         self._connection, self._wire, self._debugger, self._number = connection, Wire(connection), debugger, number
-        self._going = Going(first, self._first_line)
+        self._going = StopTarget(first, self._first_line)
         self._breakpoints: dict[str, dict[int, Breakpoint]] = {}
         self._passes: Counter[tuple[str, int]] = Counter()
         """Passes of the call under way by lines of breakpoints with `hits`; editors set all anew when one is set."""
@@ -91,7 +91,7 @@ class Session:
         debugger.between = self._look_on_the_way
         self._touched = False
         """True where what was evaluated in the call may have changed something."""
-        self._away: Callable[[], Going] | None = None
+        self._away: Callable[[], StopTarget] | None = None
         """Leads on once the call under way is abandoned."""
         self._done = self._over = self._pauses = False
         self._missing = -1
@@ -138,7 +138,7 @@ class Session:
             if self._left:
                 self._say(f"the session ends: {self._left}", "stderr")
             self._wire.event("terminated")
-        except Gone:
+        except EditorDisconnected:
             self._over = True
 
     # ------------------------------------------------------------------------------------------------- going
@@ -168,13 +168,13 @@ class Session:
             return
         stops = self._breaks if going.stops == self._breaks else self._first_line
         if going.call + 1 < len(self._debugger.calls):
-            self._going = Going(going.call + 1, stops)
+            self._going = StopTarget(going.call + 1, stops)
         else:
             self._say("this was the last call; at its last line again")
             self._away = partial(self._end, going.call + 1)
             self._going = self._led()
 
-    def _missed(self, going: Going) -> Going:
+    def _missed(self, going: StopTarget) -> StopTarget:
         """Finds where to stop in a call that has not come to the line event at which it was to: the last one that it
         had this time, then its first one."""
         ran = self._lines.count
@@ -185,13 +185,13 @@ class Session:
         )
         if ran == 0:
             self._over = going.call + 1 == len(self._debugger.calls)
-            return Going(going.call if self._over else going.call + 1, self._first_line)
+            return StopTarget(going.call if self._over else going.call + 1, self._first_line)
         if self._missing == going.call:
-            return Going(going.call, self._first_line)
+            return StopTarget(going.call, self._first_line)
         self._missing = going.call
-        return Going(going.call, _at(ran, "step"), ran)
+        return StopTarget(going.call, _at(ran, "step"), ran)
 
-    def _raised(self, fired: Fired) -> Going | None:
+    def _raised(self, fired: RepeatedCall) -> StopTarget | None:
         """Leads back to the line that has raised what the call raises, once; None where nothing is to be stopped at."""
         error, line = self._lines.raised
         if not self._stops_raised or fired.raised is None or fired.raised is not error:
@@ -200,33 +200,33 @@ class Session:
             self._raises = -1
             return None
         self._raises, self._error = fired.number, readable(error)
-        return Going(fired.number, _at(line, "exception"), line)
+        return StopTarget(fired.number, _at(line, "exception"), line)
 
-    def _before(self, error: DebugError) -> Going:
+    def _before(self, error: DebugError) -> StopTarget:
         """Goes back to the last line event in front of a call that cannot be made. Raises `DebugError` where no call
         was made yet."""
         if (at := self._debugger.at) is None:
             raise error
         self._say(f"{error}; at the last line of call {at.number} again", "stderr")
-        self._going, self._away = Going(at.number, self._first_line), partial(self._end, at.number + 1)
+        self._going, self._away = StopTarget(at.number, self._first_line), partial(self._end, at.number + 1)
         return self._led()
 
-    def _led(self) -> Going:
+    def _led(self) -> StopTarget:
         """Finds where a command leads; of one that fails, prints the reason and begins the call again."""
         assert self._away is not None
         here, away, self._away = self._going.call, self._away, None
-        self._raises = -1  # who comes to that line anew is stopped at it anew
+        self._raises = -1  # a call that reaches that line anew stops anew
         try:
             return away()
         except Abandoned:
             return self._reached()
         except (ReplayError, OperatorFailure) as error:
             self._say(str(error), "stderr")
-            return Going(here, self._first_line)
+            return StopTarget(here, self._first_line)
 
-    def _reached(self) -> Going:
+    def _reached(self) -> StopTarget:
         """The call behind the one at which a way to another was broken off: the only one to which no way leads anew."""
-        return Going(self._debugger.reached + 1, self._first_line)
+        return StopTarget(self._debugger.reached + 1, self._first_line)
 
     def _look_on_the_way(self) -> None:
         """Answers requests between two calls on the way to another, which a pause breaks off."""
@@ -243,7 +243,7 @@ class Session:
                     self._look()
                 self._count(frame)
                 at_line(frame, count)
-            except Gone as error:
+            except EditorDisconnected as error:
                 raise self._abandoned(error) from error
 
         def through(process: Process, firing: Firing) -> dict[str, Message]:
@@ -251,7 +251,7 @@ class Session:
             self._passes.clear()
             try:
                 self._look()
-            except Gone as error:
+            except EditorDisconnected as error:
                 raise self._abandoned(error) from error
             self._lines = lines = Lines(looking, self._homes)
             made = lines.through(process, firing)
@@ -261,7 +261,7 @@ class Session:
 
         return through
 
-    def _abandoned(self, error: Gone) -> Abandoned:
+    def _abandoned(self, error: EditorDisconnected) -> Abandoned:
         """Ends the session within a call, whose operator has not raised that error."""
         self._over, self._left = True, str(error)
         return Abandoned()
@@ -272,7 +272,7 @@ class Session:
         if self._over:
             raise Abandoned
 
-    def _check(self, fired: Fired) -> None:
+    def _check(self, fired: RepeatedCall) -> None:
         """Compares the outputs of a call with the recorded ones, and prints a difference."""
         ports = ", ".join(made.port for made in fired.made if not made.same)
         verdict = AS_RECORDED if fired.same else f"not as recorded{f', differs in {ports}' if ports else ''}"
@@ -340,7 +340,7 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- back
 
-    def _last(self, first: int, last: int, wanted: Stops, spot: Spot | None = None) -> tuple[int, int] | None:
+    def _last(self, first: int, last: int, wanted: Stops, spot: CodePosition | None = None) -> tuple[int, int] | None:
         """Makes calls, up to a spot if there is one. Returns the last line event at which `wanted` would stop: its call
         and its number in that."""
         found: tuple[int, int] | None = None
@@ -360,7 +360,7 @@ class Session:
             call += 1
         return found
 
-    def _back(self, call: int, spot: Spot | None, wanted: Stops, why: str) -> Going:
+    def _back(self, call: int, spot: CodePosition | None, wanted: Stops, why: str) -> StopTarget:
         """The last line event before, in this call or in earlier ones, at which `wanted` would stop; else the beginning
         of the first one. A pause leads to the calls that are being looked at."""
         found = None if spot is None else self._last(call, call, wanted, spot)
@@ -370,9 +370,11 @@ class Session:
             found = self._last(first, call - 1, wanted)
             call, width = first, 2 * width
         self._missing = -1
-        return Going(call, self._first_line) if found is None else Going(found[0], _at(found[1], why), found[1])
+        return (
+            StopTarget(call, self._first_line) if found is None else StopTarget(found[0], _at(found[1], why), found[1])
+        )
 
-    def _end(self, calls: int) -> Going:
+    def _end(self, calls: int) -> StopTarget:
         """The last line event of the recording. Ends the session where no call has any."""
         going = self._back(calls, None, _everywhere, "end of the recording")
         if going.stops == self._first_line and not (self._over or self._pauses):
@@ -380,15 +382,15 @@ class Session:
             self._say("no call runs a line of the operator's source", "stderr")
         return going
 
-    def _anew(self, call: int) -> Going:
+    def _anew(self, call: int) -> StopTarget:
         """The same call from its beginning, with the source as it was edited since."""
         changed = self._debugger.reload()
         self._say(f"taken over: {', '.join(changed)}" if changed else "no source has changed")
-        return Going(call, self._first_line)
+        return StopTarget(call, self._first_line)
 
-    def _to(self, text: str) -> Going:
+    def _to(self, text: str) -> StopTarget:
         try:
-            return Going(self._debugger.goto(self._number(text)).number, self._first_line)
+            return StopTarget(self._debugger.goto(self._number(text)).number, self._first_line)
         except ValueError as error:
             raise ReplayError(str(error)) from error
 
@@ -427,7 +429,7 @@ class Session:
             if name in ("launch", "attach"):
                 self._wire.event("initialized")
             return self._over or (self._away is not None and not moved)
-        except Gone:
+        except EditorDisconnected:
             raise
         except Exception as error:
             self._wire.answer(request, error=f"{name}: {readable(error)}")
@@ -450,7 +452,7 @@ class Session:
             "restart": partial(self._anew, call),
         }
         if name in on:
-            return partial(setattr, self, "_going", Going(call, on[name]))
+            return partial(setattr, self, "_going", StopTarget(call, on[name]))
         return partial(setattr, self, "_away", away[name]) if name in away else None
 
     # ------------------------------------------------------------------------------------------------- requests
@@ -462,7 +464,7 @@ class Session:
 
     def _launch(self, arguments: Mapping[str, Any]) -> None:
         if not arguments.get("stopOnEntry", True):
-            self._going = Going(self._going.call, self._breaks)
+            self._going = StopTarget(self._going.call, self._breaks)
 
     def _begin(self, arguments: Mapping[str, Any]) -> None:
         self._done = True

@@ -15,7 +15,7 @@ FIELDS = {b"Content-Length", b"Content-Type"}
 """Of the head of a message; the head of a page's request has others."""
 
 
-class Gone(ConnectionError):
+class EditorDisconnected(ConnectionError):
     """Raised where the editor has left, or sends something else."""
 
 
@@ -27,26 +27,26 @@ class Wire:
         self._numbers = count(1)
 
     def request(self, *, wait: bool) -> Mapping[str, Any] | None:
-        """Returns the next request; None where none is there, unless it waits. Raises `Gone`."""
+        """Returns the next request; None where none is there, unless it waits. Raises `EditorDisconnected`."""
         while (found := self._parsed()) is None:
             if not wait and not select.select([self._connection], [], [], 0)[0]:
                 return None
             try:
                 more = self._connection.recv(2**16)
             except OSError as error:
-                raise Gone(str(error)) from error
+                raise EditorDisconnected(str(error)) from error
             if not more:
-                raise Gone("the editor has closed the connection")
+                raise EditorDisconnected("the editor has closed the connection")
             self._read += more
         return found
 
     def answer(self, request: Mapping[str, Any], body: Mapping[str, Any] | None = None, error: str = "") -> None:
-        """Sends the response to a request; with `error` it has failed. Raises `Gone`."""
+        """Sends the response to a request; with `error` it has failed. Raises `EditorDisconnected`."""
         told = {"request_seq": request["seq"], "command": request["command"], "success": not error}
         self._send("response", told | ({"message": error} if error else {"body": body or {}}))
 
     def event(self, name: str, **body: Any) -> None:
-        """Sends an event. Raises `Gone`."""
+        """Sends an event. Raises `EditorDisconnected`."""
         self._send("event", {"event": name, "body": body})
 
     def _send(self, kind: str, content: Mapping[str, Any]) -> None:
@@ -54,13 +54,13 @@ class Wire:
         try:
             self._connection.sendall(b"Content-Length: %d\r\n\r\n%s" % (len(data), data))
         except OSError as error:
-            raise Gone(str(error)) from error
+            raise EditorDisconnected(str(error)) from error
 
     def _parsed(self) -> Mapping[str, Any] | None:
         head, found, rest = self._read.partition(b"\r\n\r\n")
         if not found:
             if len(head) > MOST_BYTES:
-                raise Gone("no header of the Debug Adapter Protocol")
+                raise EditorDisconnected("no header of the Debug Adapter Protocol")
             return None
         try:
             fields = dict(line.split(b":", 1) for line in head.split(b"\r\n"))
@@ -76,5 +76,5 @@ class Wire:
             if not isinstance(request["command"], str) or not isinstance(request["seq"], int):
                 raise TypeError("command or seq")
         except (ValueError, KeyError, TypeError) as error:
-            raise Gone(f"no message of the Debug Adapter Protocol: {error!r}") from error
+            raise EditorDisconnected(f"no message of the Debug Adapter Protocol: {error!r}") from error
         return request  # type: ignore[no-any-return]

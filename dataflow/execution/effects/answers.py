@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from dataflow.execution.effects.surroundings import surroundings
+from dataflow.execution.effects.captured_values import surroundings
 from dataflow.execution.failure import text_of
 from dataflow.execution.snapshots import pack_state, unpack_state
 from dataflow.messages.base import Message

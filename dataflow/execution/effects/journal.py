@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.execution.effects.answers import Answer, Call, EffectMiss, Key
-from dataflow.execution.effects.surroundings import texts_around
+from dataflow.execution.effects.captured_values import texts_around
 from dataflow.recording.limits import MAX_EFFECT_BYTES
 
 EFFECTS = "effects"

@@ -72,7 +72,7 @@ class Window:
         self._look()
 
 
-class Handover:
+class TransferCounters:
     """Messages and bytes that one thread has put and another has not taken yet; every number has one writer."""
 
     def __init__(self) -> None:

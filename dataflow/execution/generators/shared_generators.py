@@ -20,7 +20,7 @@ class SharedGenerators(RuntimeError):
     """A live source draws from generators that operators of its process depend on."""
 
 
-class AtWork:
+class CallTracker:
     """The calls of operators in this process: how many began and ended. Entered and left on the main thread."""
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class AtWork:
         self.operator, self.stamp = "", 0
         """Of the last call that began: the operator, and its event time; 0 or less where it has none."""
 
-    def call(self, operator: str, stamp: int) -> AtWork:
+    def call(self, operator: str, stamp: int) -> CallTracker:
         """This, to be entered for a call of an operator."""
         self.operator, self.stamp = operator, stamp
         return self
@@ -43,13 +43,13 @@ class AtWork:
         self.ended += 1
 
 
-AT_WORK = AtWork()
+CALLS_IN_PROGRESS = CallTracker()
 
 
 class Tripwire:
     """Compares the global generators before and after one step of a source."""
 
-    def __init__(self, work: AtWork = AT_WORK) -> None:
+    def __init__(self, work: CallTracker = CALLS_IN_PROGRESS) -> None:
         self._work = work
         self._begun = 0
         self._before: tuple[object, ...] | None = None

@@ -13,7 +13,7 @@ from typing import Any
 
 import pydantic
 
-from dataflow.graph.drafts import Absence, Alias, Choice, Draft, Expansion, GraphInput, Pattern, Scope
+from dataflow.graph.drafts import Absence, Alias, Choice, Expansion, GraphInput, OperatorDraft, Pattern, Scope
 from dataflow.graph.expansion.graph_parameters import GraphParameters
 from dataflow.graph.expansion.settings import Setting, overridden, read_settings
 from dataflow.graph.expansion.wiring import OR, Wiring
@@ -321,7 +321,7 @@ class Expander:
         values = self.fields.table(tree, "params") or Table({}, entry.key.place)
         wired = self.wiring.read(table.get("inputs"), scope, inputs)
         self.out.drafts.append(
-            Draft(
+            OperatorDraft(
                 name=full,
                 place=entry.key.place,
                 file=scope.file,

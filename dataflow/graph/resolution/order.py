@@ -1,11 +1,11 @@
-"""The graph as a whole: cycles that would wait for themselves, the order of operators, who is fed by devices."""
+"""The graph as a whole: cycles that would wait for themselves, the order of operators, which are fed by devices."""
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
 
-from dataflow.graph.drafts import Wired
+from dataflow.graph.drafts import WiredOperator
 from dataflow.graph.model import Stream
 from dataflow.graph.problems import Place, Problems
 from dataflow.graph.reach import reached
@@ -20,7 +20,7 @@ MAX_CYCLES = 8
 """Cycles that are reported at most."""
 
 
-def refuse_stuck_cycles(wired: Iterable[Wired], streams: Mapping[str, Stream], problems: Problems) -> None:
+def refuse_stuck_cycles(wired: Iterable[WiredOperator], streams: Mapping[str, Stream], problems: Problems) -> None:
     """Reports cycles that would wait for themselves, at most `MAX_CYCLES` of them."""
     edges: list[DemandEdge] = []
     places: dict[DemandEdge, tuple[Place, str]] = {}
@@ -62,7 +62,7 @@ def refuse_stuck_cycles(wired: Iterable[Wired], streams: Mapping[str, Stream], p
         edges = [e for e in edges if e not in cycle.edges]
 
 
-def fed_by_devices(wired: Sequence[Wired], streams: Mapping[str, Stream], *, live: bool) -> set[str]:
+def fed_by_devices(wired: Sequence[WiredOperator], streams: Mapping[str, Stream], *, live: bool) -> set[str]:
     """Names of the operators that have a source upstream that cannot wait (`Source.real_time`; in a live run, any)."""
     takers: dict[str, set[str]] = {w.draft.name: set() for w in wired}
     for w in wired:
@@ -72,7 +72,7 @@ def fed_by_devices(wired: Sequence[Wired], streams: Mapping[str, Stream], *, liv
     return devices | reached(devices, takers.__getitem__)
 
 
-def in_order(wired: Sequence[Wired], streams: Mapping[str, Stream]) -> list[str]:
+def in_order(wired: Sequence[WiredOperator], streams: Mapping[str, Stream]) -> list[str]:
     """Producers before consumers, otherwise as written; edges of inputs with `before` count only where they can."""
     index = {w.draft.name: i for i, w in enumerate(wired)}
     firm: dict[str, set[str]] = {name: set() for name in index}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dataflow.graph.drafts import Draft
+from dataflow.graph.drafts import OperatorDraft
 from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean
 from dataflow.graph.yaml.fields import Fields
@@ -20,7 +20,7 @@ _QUEUES: Mapping[str, QueuePolicy] = {"newest": "newest", "oldest": "oldest", "b
 _STALE: Mapping[str, StalePolicy] = {"use": "use", "drop": "drop"}
 
 
-def sync_tolerance(draft: Draft, fields: Fields) -> int:
+def sync_tolerance(draft: OperatorDraft, fields: Fields) -> int:
     """Nanoseconds of the operator's join: the graph's `sync:` or the class's own."""
     spec = draft.cls.spec
     tree = draft.sync.get("tolerance") if isinstance(draft.sync, Table) else None
@@ -34,7 +34,7 @@ def sync_tolerance(draft: Draft, fields: Fields) -> int:
     return spec.tolerance if given is None else given
 
 
-def sync_every(draft: Draft, fields: Fields) -> int | None:
+def sync_every(draft: OperatorDraft, fields: Fields) -> int | None:
     """Period (ns) of the operator's ticks: the graph's `sync:` or the class's own."""
     spec = draft.cls.spec
     sync = fields.table(draft.sync, "sync", ("tolerance", "every"))
@@ -51,7 +51,7 @@ def sync_every(draft: Draft, fields: Fields) -> int | None:
     return given or spec.every
 
 
-def live_policy(draft: Draft, devices: bool, fields: Fields) -> Live:
+def live_policy(draft: OperatorDraft, devices: bool, fields: Fields) -> Live:
     """The operator's `live:`. `devices`: something upstream is a source that cannot wait."""
     keys = ("queue", "size", "wait", "deadline", "restart", "memory", "on_stale", "clock")
     table = fields.table(draft.live, "live", keys)
@@ -75,7 +75,7 @@ def live_policy(draft: Draft, devices: bool, fields: Fields) -> Live:
     )
 
 
-def _corrected(tree: Tree | None, draft: Draft, fields: Fields) -> bool:
+def _corrected(tree: Tree | None, draft: OperatorDraft, fields: Fields) -> bool:
     """Returns whether stamps are corrected by the measured offset of the machine's clock."""
     chosen = fields.choice(tree, "clock", {"own": "own", "corrected": "corrected"})
     if tree is not None and chosen == "corrected" and not (draft.machine and is_source(draft.cls)):
@@ -84,7 +84,7 @@ def _corrected(tree: Tree | None, draft: Draft, fields: Fields) -> bool:
     return chosen == "corrected"
 
 
-def _waits(tree: Tree | None, draft: Draft, devices: bool, fields: Fields) -> dict[str, int | None]:
+def _waits(tree: Tree | None, draft: OperatorDraft, devices: bool, fields: Fields) -> dict[str, int | None]:
     spec = draft.cls.spec
     waits = {name: default_wait(spec, port, devices) for name, port in spec.inputs.items()}
     if isinstance(tree, Table):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dataflow.graph.drafts import Absence, Alias, Choice, Draft, Expansion, Pattern
+from dataflow.graph.drafts import Absence, Alias, Choice, Expansion, OperatorDraft, Pattern
 from dataflow.graph.keys import has_wildcard
 from dataflow.graph.problems import Place, Problems
 
@@ -113,7 +113,7 @@ class Presence:
 
     # -- operators -----------------------------------------------------------------------------------------------
 
-    def _lack(self, draft: Draft) -> tuple[Absence, ...]:
+    def _lack(self, draft: OperatorDraft) -> tuple[Absence, ...]:
         """Why an operator cannot be: an input that it needs is not there, and the file that names it may say so."""
         for name, choices in draft.choices.items():
             port = draft.cls.spec.inputs.get(name)
@@ -124,7 +124,7 @@ class Presence:
                 return reasons
         return ()
 
-    def _choose(self, draft: Draft) -> None:
+    def _choose(self, draft: OperatorDraft) -> None:
         for name, choices in draft.choices.items():
             allowed = [
                 self._allowed(choice, draft.name, f"{draft.name}.{name}", draft.input_places[name])
@@ -135,7 +135,7 @@ class Presence:
                 draft.inputs[name] = list(patterns)
 
     def _allowed(self, choice: Choice, who: str, what: str, place: Place) -> bool:
-        """Reports a choice of which nothing is there, though who names it is not inside the graph that lacks it."""
+        """Reports a choice of which nothing is there, though it is not named inside the graph that lacks it."""
         reasons = () if self.found(choice) else self.why(choice)
         if not reasons or _known(who, reasons):
             return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
+from dataflow.graph.drafts import Expansion, GraphInput, OperatorDraft, Pattern, WiredOperator
 from dataflow.graph.expansion.wiring import read_pattern
 from dataflow.graph.keys import has_wildcard
 from dataflow.graph.model import INPUT_CLASS, Bundle, Graph, Node, input_text
@@ -79,9 +79,9 @@ class Resolver:
 
     # -- one operator's inputs -----------------------------------------------------------------------------------
 
-    def wire(self, draft: Draft) -> Wired:
+    def wire(self, draft: OperatorDraft) -> WiredOperator:
         spec = draft.cls.spec
-        wired = Wired(draft, {}, {})
+        wired = WiredOperator(draft, {}, {})
         for name in draft.inputs:
             if name not in spec.inputs:
                 place = draft.input_places[name]
@@ -100,7 +100,7 @@ class Resolver:
             self.check_ticks(wired)
         return wired
 
-    def wire_input(self, draft: Draft, port: InputPort, wired: Wired) -> tuple[str, ...]:
+    def wire_input(self, draft: OperatorDraft, port: InputPort, wired: WiredOperator) -> tuple[str, ...]:
         what = f"{draft.name}.{port.name}"
         own = f"{self.expansion.namespace}/{draft.name}/"
         streams: dict[str, Pattern] = {}
@@ -136,7 +136,7 @@ class Resolver:
             return
         self.problems.add(pattern.place, text, hint, self.known.via(pattern))
 
-    def too_many(self, draft: Draft, port: InputPort, streams: Mapping[str, Pattern]) -> None:
+    def too_many(self, draft: OperatorDraft, port: InputPort, streams: Mapping[str, Pattern]) -> None:
         first = next(iter(streams.values()))
         joined = len(draft.cls.spec.triggers) > 1 and not draft.cls.spec.merge and port.kind == "in"
         why = "a joined input takes one stream" if joined else "it takes one stream"
@@ -147,7 +147,7 @@ class Resolver:
         text = f"{draft.name}.{port.name}: {why}, but {len(streams)} match: {listed}"
         self.problems.add(first.place, text, hint, self.known.via(first))
 
-    def check_ticks(self, wired: Wired) -> None:
+    def check_ticks(self, wired: WiredOperator) -> None:
         """Ticks begin and end with an input that is neither static nor fed back."""
         draft = wired.draft
         spec = draft.cls.spec
@@ -163,9 +163,9 @@ class Resolver:
 
     # -- the graph as a whole ------------------------------------------------------------------------------------
 
-    def check_processes(self, drafts: Iterable[Draft]) -> None:
+    def check_processes(self, drafts: Iterable[OperatorDraft]) -> None:
         """Operators that share a process must be on one machine and in one environment."""
-        owners: dict[str, Draft] = {}
+        owners: dict[str, OperatorDraft] = {}
         for draft in drafts:
             label = draft.process.value if draft.process else draft.name
             first = owners.setdefault(label, draft)
@@ -180,7 +180,7 @@ class Resolver:
 
     # -- the resolved parts --------------------------------------------------------------------------------------
 
-    def node(self, wired: Wired, devices: bool) -> Node:
+    def node(self, wired: WiredOperator, devices: bool) -> Node:
         draft = wired.draft
         spec = draft.cls.spec
         return Node(
@@ -201,7 +201,7 @@ class Resolver:
             line=draft.place.line,
         )
 
-    def record(self, tree: Tree | None, drafts: Iterable[Draft]) -> Record:
+    def record(self, tree: Tree | None, drafts: Iterable[OperatorDraft]) -> Record:
         everything = tuple(sorted(self.streams))
         if tree is None or (isinstance(tree, Leaf) and tree.value == "all"):
             return Record(everything)

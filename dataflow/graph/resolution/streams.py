@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dataflow.graph.drafts import Draft, Expansion, Pattern
+from dataflow.graph.drafts import Expansion, OperatorDraft, Pattern
 from dataflow.graph.keys import has_wildcard, matching, may_reach
 from dataflow.graph.model import Stream
 from dataflow.graph.problems import Place, Problems, nearest
@@ -101,7 +101,7 @@ class Streams:
             return stream.removeprefix(f"{scope}/")
         return f"/{stream}"
 
-    def scope_of(self, draft: Draft) -> str:
+    def scope_of(self, draft: OperatorDraft) -> str:
         parent = draft.name.rpartition("/")[0]
         return f"{self.expansion.namespace}/{parent}" if parent else self.expansion.namespace
 

@@ -17,8 +17,8 @@ from dataflow.interop.bag import Topic
 from dataflow.interop.export.extras import ROSBAG2, carry
 from dataflow.interop.export.report import Exported
 from dataflow.interop.export.source import ExportSource, distinct
-from dataflow.interop.ros.made import typestore
-from dataflow.interop.ros.outward import OUTWARD
+from dataflow.interop.ros.construction import typestore
+from dataflow.interop.ros.to_ros2 import OUTWARD
 from dataflow.interop.topics import UNIT
 from dataflow.interop.typestores import RosType, ros_type
 from dataflow.messages import (

@@ -11,7 +11,7 @@ from dataflow.interop.account import Account
 from dataflow.interop.bag import Bag, BagError, Stored, Topic, shortfalls
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign, open_bag
-from dataflow.interop.playing import PLAIN, Wishes, readable
+from dataflow.interop.playing import PLAIN, BagReadOptions, readable
 from dataflow.interop.streams import BagStreams
 from dataflow.messages import Message
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
@@ -48,7 +48,7 @@ class ExportSource:
         clock: Choice = "auto",
         start: int | None = None,
         end: int | None = None,
-        wishes: Wishes = PLAIN,
+        wishes: BagReadOptions = PLAIN,
     ) -> None:
         self.path, self.foreign = Path(path), is_foreign(Path(path))
         self._reader: Recording | BagStreams | None = None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.interop.seen import lose
+from dataflow.interop.access_tracking import lose
 from dataflow.messages import PointCloud
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.streams.pixels import rows_without_padding
@@ -20,7 +20,7 @@ _RING = ("ring", "channel", "line", "laser_id")
 _TIMES = ("time", "t", "timestamp", "time_offset", "offset_time", "time_stamp")
 _COLOR = ("rgb", "rgba")
 TYPICAL_PERIOD = 0.1
-"""Seconds from cloud to cloud where the recording does not tell."""
+"""Seconds from cloud to cloud where the recording does not show it."""
 
 
 def point_cloud(message: Any, stamp: int, period: float = TYPICAL_PERIOD) -> PointCloud:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.interop.access_tracking import lose
 from dataflow.interop.conversions import decoded, inverse_depth, rgb
 from dataflow.interop.ros.rvl import unpacked_rvl
 from dataflow.interop.ros.values import first, known, optional
-from dataflow.interop.seen import lose
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, CompressedVideo, DepthImage, Image, Image16
 from dataflow.messages.camera import COEFFICIENTS
 from dataflow.messages.images import PNG_SIGNATURE, START_CODES, file_format

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.interop.access_tracking import lose
 from dataflow.interop.ros.values import orientation, vector
-from dataflow.interop.seen import lose
 from dataflow.messages import Boxes3D, Detections2D, Path
 from dataflow.recording.errors import RecordingError
 

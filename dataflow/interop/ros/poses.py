@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.interop.access_tracking import lose
 from dataflow.interop.ros.values import covariance, orientation, time_ns, vector
-from dataflow.interop.seen import lose
 from dataflow.messages import Odometry, ParticleSet, Path, Point, Pose, Transforms, Twist
 
 

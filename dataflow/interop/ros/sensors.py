@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 import dataflow.messages as messages
+from dataflow.interop.access_tracking import lose
 from dataflow.interop.ros.values import covariance, optional, orientation, variance, vector
-from dataflow.interop.seen import lose
 from dataflow.messages.poses import COVARIANCE_TYPES
 from dataflow.messages.values import ALARM_LEVELS
 from dataflow.recording.errors import RecordingError

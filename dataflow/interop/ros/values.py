@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.interop.seen import lose
+from dataflow.interop.access_tracking import lose
 from dataflow.messages.checks import QUATERNION_TOLERANCE
 
 F64 = npt.NDArray[np.float64]

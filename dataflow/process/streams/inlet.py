@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from dataflow.process.channel import Channel
-from dataflow.process.streams.losses import NoLoss
+from dataflow.process.streams.losses import LosslessPolicy
 from dataflow.process.streams.stream_order import StreamOrder
 from dataflow.process.throttled_warnings import ThrottledWarnings
 from dataflow.transport import DecodeError, Envelope, Kind, decode
@@ -28,7 +28,7 @@ class Inlet:
         deliver: Deliver,
         *,
         static: Collection[str],
-        losses: NoLoss,
+        losses: LosslessPolicy,
         from_start: bool = False,
         complaints: ThrottledWarnings | None = None,
     ) -> None:

@@ -10,7 +10,7 @@ class StreamDamaged(RuntimeError):
     """Messages of a stream were lost where none may be."""
 
 
-class NoLoss:
+class LosslessPolicy:
     """Nothing may be lost: going on would mean computing something else than was sent."""
 
     def __init__(self, label: str) -> None:
@@ -34,8 +34,8 @@ class NoLoss:
         raise error
 
 
-class LossTold(NoLoss):
-    """A live run goes on: the supervisor is told, and what does not fit is refused and counted."""
+class LossReportingPolicy(LosslessPolicy):
+    """A live run goes on: the supervisor is notified, and what does not fit is refused and counted."""
 
     def __init__(self, label: str, channel: Channel) -> None:
         super().__init__(label)
@@ -52,6 +52,6 @@ class LossTold(NoLoss):
         """Nothing more: the inlet refuses it."""
 
 
-def losses_of(label: str, channel: Channel, *, live: bool) -> NoLoss:
+def losses_of(label: str, channel: Channel, *, live: bool) -> LosslessPolicy:
     """Returns what a process of a run does."""
-    return LossTold(label, channel) if live else NoLoss(label)
+    return LossReportingPolicy(label, channel) if live else LosslessPolicy(label)

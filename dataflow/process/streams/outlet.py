@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import Channel
-from dataflow.process.config import Resumed
+from dataflow.process.config import ResumeState
 from dataflow.process.streams.recent import RecentFirings
 from dataflow.process.streams.stream_order import Place
 from dataflow.records.black_box import BlackBox
@@ -133,7 +133,7 @@ class Outlet:
                     link.send(channel, parts, parts_size(parts))
 
     def push(self) -> None:
-        """Sends what has waited for room, as far as there is some, and static messages to who was started again."""
+        """Sends what has waited for room, as far as there is some, and static messages to restarted processes."""
         if self._fanout.quiet():
             return
         for keys, link in self._fanout.joined():
@@ -194,7 +194,7 @@ class Outlet:
         self.sent += self._fanout.send(stream, parts, envelope, droppable=droppable)
 
     def _send_records(self, operator: str, batch: bytes) -> None:
-        """Sends firing records, to the recorder and to who subscribes to them from outside."""
+        """Sends firing records, to the recorder and to subscribers from outside."""
         self._send_bytes(firings_key(self._namespace, operator), batch)
 
     def _send_bytes(self, key: str, batch: bytes) -> None:
@@ -272,7 +272,7 @@ class Outlet:
             self._note_last()
 
     def _note_last(self) -> None:
-        """Gives the last record to the recorder's batch, and to those who ask for latencies."""
+        """Gives the last record to the recorder's batch, and to requests for latencies."""
         record, self._unnoted = self._unnoted, None
         if record is None:
             return
@@ -321,12 +321,12 @@ class Outlet:
             self._network.bus.session.put(stream, payload)
 
 
-def incarnations_of(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
+def incarnations_of(resumed: Mapping[str, ResumeState], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
     """The incarnations that streams begin with, by stream; `outputs`: by operator, its ports and their streams."""
     return {stream: before.incarnation for operator, before in resumed.items() for stream in outputs[operator].values()}
 
 
-def left_by(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, Place]:
+def left_by(resumed: Mapping[str, ResumeState], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, Place]:
     """The places that streams had reached in the process before this one, by stream (`outputs` as above)."""
     return {
         outputs[operator][port]: (incarnation, number)

@@ -1,4 +1,4 @@
-"""Keeps the last firings of every operator of a process, for those who ask for latencies or spans while it runs."""
+"""Keeps the last firings of every operator of a process, for requests for latencies or spans while it runs."""
 
 from __future__ import annotations
 

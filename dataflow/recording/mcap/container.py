@@ -34,7 +34,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.limits import MAX_CHANNELS, MAX_CHUNK_BYTES, MAX_CHUNK_MESSAGES, MAX_PARSED, MAX_RECORD_BYTES
 from dataflow.recording.mcap.attachments import Attachment
 from dataflow.recording.mcap.ending import MAGIC, KeptIndexes, ending, record_bytes
-from dataflow.recording.mcap.packing import Buffer, Compression, Gathered, Packer, message_size
+from dataflow.recording.mcap.packing import Buffer, Compression, Packer, PendingChunk, message_size
 from dataflow.recording.mcap.seals import sealed
 from dataflow.recording.parts import OWNER_ONLY, created
 
@@ -77,7 +77,7 @@ class ContainerWriter:
         """Schemas, channels and metadata that go to the disk with the next chunk, or at a flush."""
         self._lasting = 0, 0, 0
         """Numbers of schemas, channels and metadata in the file."""
-        self._open: dict[Literal["record", "message"], Gathered] = {}
+        self._open: dict[Literal["record", "message"], PendingChunk] = {}
         """The chunks in progress."""
         self.first_time: int | None = None
         self.last_time = 0
@@ -194,7 +194,7 @@ class ContainerWriter:
         now = self._begin(self._open[kind].size + size if kind in self._open else 0)
         chunk = self._open.get(kind)
         if chunk is None:
-            chunk = self._open[kind] = Gathered(now)
+            chunk = self._open[kind] = PendingChunk(now)
         for channel, log_time, sequence, parts in group:
             chunk.add(channel, log_time, sequence, parts, published)
         if chunk.size >= self._chunk_bytes or chunk.messages >= MAX_CHUNK_MESSAGES:
@@ -248,7 +248,7 @@ class ContainerWriter:
                 self._counts[channel] += count
         self._open.clear()
 
-    def _gathered(self) -> list[Gathered]:
+    def _gathered(self) -> list[PendingChunk]:
         """The chunks in progress, in the order in which they are written."""
         return [self._open[kind] for kind in ("record", "message") if kind in self._open]
 

@@ -56,7 +56,7 @@ class MessageIndex(Protocol):
         `skip` messages may be left out."""
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
-        """Messages by channel from which sizes are told, and the chunks that hold them (None: all)."""
+        """Messages by channel from which sizes are estimated, and the chunks that hold them (None: all)."""
 
 
 class LoadedIndex:

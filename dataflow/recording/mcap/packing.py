@@ -35,7 +35,7 @@ def message_size(parts: Sequence[Buffer]) -> int:
 
 
 @dataclass(slots=True)
-class Gathered:
+class PendingChunk:
     """Messages for one chunk, since the time (s, monotonic) of the first one."""
 
     since: float
@@ -73,7 +73,7 @@ class Packer:
         self._compress = _compressor(compression)
         self._name = "" if compression == "none" else compression
 
-    def pack(self, chunk: Gathered, position: int) -> tuple[list[bytes], ChunkIndex]:
+    def pack(self, chunk: PendingChunk, position: int) -> tuple[list[bytes], ChunkIndex]:
         """A chunk and its message indexes as they lie in the file from `position`, and its entry in the index."""
         raw = b"".join(chunk.parts)
         data = self._compress(raw)

@@ -81,7 +81,7 @@ def machine_facts(environment: Mapping[str, str] | None = None) -> dict[str, dic
 
 
 def _cpu() -> tuple[str, frozenset[str]]:
-    """Model name and feature flags; what the system does not tell stays empty."""
+    """Model name and feature flags; what the system does not report stays empty."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:

@@ -242,7 +242,7 @@ class _JoinedIndex:
             before += passed
 
     def sample(self) -> tuple[Mapping[int, Entries], Column | None]:
-        raise RecordingError("the sizes of streams are told part by part")
+        raise RecordingError("sizes of streams are available part by part only")
 
     def _moved(self, number: int, entries: Entries, after: int | None) -> Entries:
         kept = entries if after is None else entries.where(entries.times > after)

@@ -31,7 +31,7 @@ from dataflow.recording.streams.streams import (
     StreamChannel,
     StreamFinder,
     StreamInfo,
-    Unread,
+    UnreadableMessages,
     decoded,
     unreadable,
 )
@@ -91,7 +91,7 @@ class Recording:
         return self._file.lacking
 
     @property
-    def unread(self) -> Mapping[str, Unread]:
+    def unread(self) -> Mapping[str, UnreadableMessages]:
         """By stream the messages of other programs that were passed over, since they cannot be read; complete for those
         streams that have been read."""
         return {name: s.unread for name, s in self._streams.items() if s.unread is not None}

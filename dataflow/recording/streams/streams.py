@@ -25,7 +25,7 @@ from dataflow.recording.streams.part_folder import PartedFile
 
 
 @dataclass(slots=True)
-class Unread:
+class UnreadableMessages:
     """Messages that cannot be read and were passed over: how many, and what is wrong with the first."""
 
     count: int
@@ -143,12 +143,12 @@ class IndexedStream:
     info: StreamInfo
     own: bool
     channels: list[StreamChannel] = field(default_factory=list)
-    unread: Unread | None = None
+    unread: UnreadableMessages | None = None
 
     def pass_over(self, count: int, reason: str) -> None:
         """Notes messages that cannot be read; of several passes the one that found most counts."""
-        known = self.unread or Unread(0, reason)
-        self.unread = Unread(max(known.count, count), known.reason)
+        known = self.unread or UnreadableMessages(0, reason)
+        self.unread = UnreadableMessages(max(known.count, count), known.reason)
 
 
 class StreamFinder:

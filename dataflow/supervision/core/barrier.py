@@ -7,7 +7,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, RunState, notice
+from dataflow.supervision.core.run_state import RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 
 HEARD_WITHIN = 30.0
@@ -21,7 +21,7 @@ class Barrier:
         self.run = run
         self._deadline = 0.0
         self._probing = False
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
 
     def begin(self) -> None:
         run = self.run
@@ -39,7 +39,7 @@ class Barrier:
             status.first = first if status.first is None else min(first, status.first)
         if steps is not None:
             status.steps = max(steps, status.steps or 0)
-        if self.run.release is None:  # others may be sending probes already, so it may see one before it is told to
+        if self.run.release is None:  # others may be sending probes already, so it may see one before it is asked to
             process.unseen = self.run.takes(process)
 
     def tick(self) -> bool:
@@ -110,7 +110,7 @@ def expect_probes(run: RunState, process: Supervised) -> None:
 
 
 def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
-    """Notifies the consumers of a process that it is away, or that it is to be heard again."""
+    """Notifies the consumers of a process that it is away, or that it is back."""
     made = set(process.plan.publish)
     for other in run.processes.values():
         taken = made & run.takes(other)

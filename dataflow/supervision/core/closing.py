@@ -1,7 +1,7 @@
 """The end of a run: first the processes with operators leave, then the recorder and the like, then none is left.
 
 A run that is stopped while it starts has nothing to drain: a process that is still starting is killed soon, which is
-no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run
+no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is notified how the run
 ended only when nothing can go wrong with the others any more. Every step is bounded; a process that is late is killed.
 """
 
@@ -12,13 +12,13 @@ from typing import Any
 
 from dataflow.supervision.core.life import Life, Step
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, Phase, RunState, notice
+from dataflow.supervision.core.run_state import Phase, RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 
 LEAVE_TIMEOUT = 10.0
 LEAVE_AT_ONCE = 1.0
 DIE_WITHIN = 1.0
-"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is told to leave."""
+"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is asked to leave."""
 CLOSE_TIMEOUT = 60.0
 """Seconds for `close()` of every operator, at the orderly end of a run; a shorter `stall_timeout` shortens it."""
 SHORTEST = 5.0
@@ -38,7 +38,7 @@ class Closing:
         self.run, self.outcome, self.failure = run, outcome, failure
         self._at_once = at_once
         self._hand_over = hand_over
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
         self._deadline = 0.0
         run.enter(Phase.CLOSING)
         self._begin(sinks=False)

@@ -47,11 +47,11 @@ class Withdraw:
 
 
 @dataclass(frozen=True, slots=True)
-class Over:
+class RunEnded:
     """The run is over: no process is left. Exactly one of the two is given."""
 
     report: RunReport | None
     failure: RunFailed | None
 
 
-Command = Spawn | Send | Signal | Announce | Withdraw | Over
+Command = Spawn | Send | Signal | Announce | Withdraw | RunEnded

@@ -10,7 +10,7 @@ from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.watchers.counts import Counts
 from dataflow.supervision.core.watchers.diagnostics import DiagnosticsWatcher
 from dataflow.supervision.core.watchers.drain_limit import DrainLimit
-from dataflow.supervision.core.watchers.flow_control import LiveCover, LosslessCover
+from dataflow.supervision.core.watchers.flow_control import LiveFlowControl, LosslessFlowControl
 from dataflow.supervision.core.watchers.heartbeats import Heartbeats
 from dataflow.supervision.core.watchers.lateness import Lateness
 from dataflow.supervision.core.watchers.leftover_records import LeftoverRecords
@@ -31,14 +31,14 @@ def _lossless(run: RunState) -> Core:
     """Nothing may be lost: sources wait for all, and the first death ends the run."""
     quiescence = Quiescence(run)
     watch = StallWatch(run, quiescence)
-    parts = [Counts(run), LosslessCover(run), quiescence, watch, DrainLimit(run)]
+    parts = [Counts(run), LosslessFlowControl(run), quiescence, watch, DrainLimit(run)]
     return Core(run, parts, RestartPolicy(run))
 
 
 def _live(run: RunState) -> Core:
     """Time does not wait: what fails is started again by its policy, and the rest goes on."""
     parts: list[Watcher] = []
-    remains, cover, quiescence = LeftoverRecords(run), LiveCover(run), Quiescence(run, lost_after=LOST_AFTER)
+    remains, cover, quiescence = LeftoverRecords(run), LiveFlowControl(run), Quiescence(run, lost_after=LOST_AFTER)
     restarts = LiveRestarts(run, remains, parts)
     parts += [Counts(run), remains, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
     if run.plan.faults is not None:

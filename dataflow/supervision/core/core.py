@@ -13,7 +13,7 @@ from typing import Any
 from dataflow.supervision.core import events
 from dataflow.supervision.core.barrier import Barrier
 from dataflow.supervision.core.closing import LEAVE_TIMEOUT, Closing
-from dataflow.supervision.core.commands import Announce, Command, Over, Withdraw
+from dataflow.supervision.core.commands import Announce, Command, RunEnded, Withdraw
 from dataflow.supervision.core.life import ON_ITS_WAY, Life, Step, how_it_ended
 from dataflow.supervision.core.log_keeper import LogKeeper
 from dataflow.supervision.core.report import RunFailed, RunReport, Status
@@ -43,7 +43,7 @@ class Core:
         return self.run.status
 
     def handle(self, event: events.Event, now: events.Moment) -> list[Command]:
-        """Takes in what happened and returns what is to be done. Nothing happens any more after `Over`."""
+        """Takes in what happened and returns what is to be done. Nothing happens any more after `RunEnded`."""
         self.run.now = now
         if self.run.phase is not Phase.OVER:
             try:
@@ -57,22 +57,22 @@ class Core:
     def _handle(self, event: events.Event) -> None:
         run = self.run
         match event:
-            case events.Begin():
+            case events.RunStarted():
                 self._barrier.begin()
             case events.Tick():
                 self._tick()
             case events.Paused(seconds, uncounted):
                 run.paused += uncounted if run.under_way else 0.0
                 run.event("paused", f"the supervisor did not run for {seconds:.1f} s, which count against no process")
-            case events.StopAsked():
+            case events.StopRequested():
                 self._stop()
-            case events.PlaybackAsked(action, steps, speed) if run.under_way:
+            case events.PlaybackRequested(action, steps, speed) if run.under_way:
                 run.send_all("playback", action=action, steps=steps, speed=speed)
-            case events.TriggerAsked(text) if run.under_way:
+            case events.TriggerRequested(text) if run.under_way:
                 run.trigger(text)
             case events.Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
-            case events.Said(label, kind, fields):
+            case events.Received(label, kind, fields):
                 self._said(run.processes[label], kind, fields)
             case events.Printed(label, line, log):
                 run.processes[label].words.append(line)
@@ -83,19 +83,19 @@ class Core:
             case events.NotReading(label, seconds, _, overflowed):
                 for part in self._parts:
                     part.not_reading(run.processes[label], seconds, overflowed=overflowed)
-            case events.HungUp(label):
+            case events.Disconnected(label):
                 run.processes[label].hung_up = run.steady
-            case events.LeftBehind(labels, processes):
+            case events.OrphansKilled(labels, processes):
                 who = " or ".join(map(repr, labels))
                 run.note(f"process {who} left processes behind, which were killed: {', '.join(processes)}")
-            case events.Remained(label, remains):
+            case events.RecordsRecovered(label, remains):
                 for part in self._parts:
                     part.remained(run.processes[label], remains)
             case events.LinkChanged(machine, labels, up):
                 run.link_changed(machine, labels, up=up)
             case events.ClockMeasured(machine, offset, delay):
                 run.clock_measured(machine, offset, delay)
-            case events.Died(label, code):
+            case events.Exited(label, code):
                 self._died(run.processes[label], code)
 
     # Time
@@ -125,7 +125,7 @@ class Core:
             self._close(None)
 
     def _see_to_death(self, process: Supervised) -> None:
-        """A process that closed its channel, or failed and was told to leave, has so much time to end."""
+        """A process that closed its channel, or failed and was asked to leave, has so much time to end."""
         now = self.run.steady
         if process.hung_up is not None and now - process.hung_up > LEAVE_TIMEOUT:
             self.run.kill(process, process.cause or "closed its channel and did not end")
@@ -188,7 +188,7 @@ class Core:
             part.said(process, kind, fields)
 
     def _failed(self, process: Supervised, fields: Mapping[str, Any]) -> None:
-        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be told to
+        """Takes the report of a process that one of its operators, or it itself, has failed; it waits to be asked to
         leave."""
         if process.life in (Life.KILLED, Life.FAILED):
             return  # its end is decided
@@ -241,13 +241,13 @@ class Core:
         run = self.run
         run.enter(Phase.OVER)
         report = None if closing.failure is not None else _report_of(run, self._ended_at, self._interrupted)
-        run.command(Over(report, closing.failure))
+        run.command(RunEnded(report, closing.failure))
 
 
 def _decides(event: events.Event) -> bool:
     """Returns whether a run may go on at once because of this event: a process has reached what others wait for."""
     match event:
-        case events.Said(_, "ready" | "seen" | "ended" | "closed", _) | events.Died():
+        case events.Received(_, "ready" | "seen" | "ended" | "closed", _) | events.Exited():
             return True
     return False
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from dataflow.execution.feeds.playback import Action
 from dataflow.recording.streams.logs import LogLine
-from dataflow.records.black_box import Remains
+from dataflow.records.black_box import RecoveredRecords
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Begin(Event):
+class RunStarted(Event):
     """The run begins."""
 
 
@@ -46,12 +46,12 @@ class Paused(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class StopAsked(Event):
+class StopRequested(Event):
     """The user asks for an orderly end; a second time, for an end at once."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlaybackAsked(Event):
+class PlaybackRequested(Event):
     """The user asks to pause, resume, step what is not live, or to change its speed."""
 
     action: Action
@@ -60,7 +60,7 @@ class PlaybackAsked(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class TriggerAsked(Event):
+class TriggerRequested(Event):
     """The user asks the flight recorder to save its history."""
 
     text: str
@@ -75,7 +75,7 @@ class Aborted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Said(Event):
+class Received(Event):
     """A process sent a message on its control channel."""
 
     label: str
@@ -104,14 +104,14 @@ class NotReading(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class HungUp(Event):
+class Disconnected(Event):
     """A process has closed its control channel."""
 
     label: str
 
 
 @dataclass(frozen=True, slots=True)
-class LeftBehind(Event):
+class OrphansKilled(Event):
     """A process that ended, or one of several that ended at once, has left others, which were killed: each as "name
     (process N)"."""
 
@@ -120,15 +120,15 @@ class LeftBehind(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class Remained(Event):
-    """A process has ended, and these are the firing records that it left. Comes just before its `Died`."""
+class RecordsRecovered(Event):
+    """A process has ended, and these are the firing records that it left. Comes just before its `Exited`."""
 
     label: str
-    remains: Remains
+    remains: RecoveredRecords
 
 
 @dataclass(frozen=True, slots=True)
-class Died(Event):
+class Exited(Event):
     """A process has ended. `code`: exit code, negative for a signal; None: unknown. Its last event."""
 
     label: str

@@ -3,7 +3,7 @@
     STARTING → JOINED → READY → PROBING → RUNNING → ENDED → LEAVING → CLOSED → GONE
 
 A process is forked and told what to be (STARTING), has joined the network (JOINED), has set up its operators (READY),
-sends probes until its edges are proven (PROBING), works (RUNNING), has handed in its report (ENDED), was told to leave
+sends probes until its edges are proven (PROBING), works (RUNNING), has handed in its report (ENDED), was asked to leave
 (LEAVING), and has closed everything it had open (CLOSED). One that reports a failure may leave in order
 (FAILED); one that breaks a rule is killed (KILLED). Whatever happens, the last thing is its death (GONE); where its
 restart policy allows it, it then waits for its turn (AWAY) and starts again. Its operators share its life. A sink that

@@ -43,7 +43,7 @@ class LiveFlow:
         return max((self._last[s] for s in self.upstream[operator] if s in self._last), default=NEVER)
 
     def covered(self, sources: Collection[str], lag: int) -> int:
-        """The stamp up to which everything of these sources is done by those who are `lag` behind."""
+        """The stamp up to which everything of these sources is done by those that are `lag` behind."""
         return max((self._last[s] - lag for s in sources if s in self._last), default=NEVER)
 
 

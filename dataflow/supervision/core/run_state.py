@@ -58,9 +58,9 @@ class RunState:
         """Seconds of the run for which the supervisor did not run, and `steady` stood still."""
         self._clocks: dict[str, float] = {}
         self.unreachable: dict[str, str] = {}
-        """By process on a machine of which nothing is heard, that machine."""
+        """By process on an unreachable machine, that machine."""
         self.unheard: dict[str, float] = {}
-        """By machine of which nothing is heard, since when (s)."""
+        """By unreachable machine, since when (s)."""
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
@@ -91,7 +91,7 @@ class RunState:
         return self.now.steady
 
     def event_time(self) -> int:
-        """Returns event time now (ns), as far as the supervisor can tell."""
+        """Returns event time now (ns), as far as the supervisor has it."""
         first = self.status.first
         if first is None:
             return round(self.now.wall * 1e9)
@@ -176,7 +176,7 @@ class RunState:
         if not up:
             self.unheard[machine] = self.steady
             self.unreachable |= dict.fromkeys(labels, machine)
-        what = "is back" if up else "is down: nothing of that machine is heard, and its operators go on"
+        what = "is back" if up else "is down: that machine does not answer, and its operators go on"
         self.event("link", f"the link to machine {machine!r} {what}", machine=machine, up=up)
 
     def clock_measured(self, machine: str, offset: int, delay: int) -> None:
@@ -210,7 +210,7 @@ def notice(timeout: float) -> float:
     return min(ASK_BEFORE, timeout / 5)
 
 
-class Asking:
+class StackTraceRequests:
     """Asks each process where it is, once for each time that it is stuck, before it is given up: what its threads are
     at becomes part of its last words."""
 

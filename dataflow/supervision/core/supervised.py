@@ -39,7 +39,7 @@ class Supervised:
     silent: bool = False
     """It gives no sign of life, and the others go on without it."""
     expected: int = 0
-    """Counts how often it was told to expect streams anew; an end said before it has heard of that is none."""
+    """Counts how often it was asked to expect streams anew; an end reported before that has reached it is none."""
     begins: dict[str, int] = field(default_factory=dict)
     """The incarnations that its operators began with, where it took another's place."""
     hung_up: float | None = None

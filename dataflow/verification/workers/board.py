@@ -20,7 +20,7 @@ _WORD = 8
 
 
 class Board(Watcher):
-    """The shared memory of one worker and its parent: who opens it by its descriptor sees what the other wrote.
+    """The shared memory of one worker and its parent: either opens it by its descriptor and sees what the other wrote.
 
     Integers of 64 bits: phase, operator, steps, then of each operator its firings, messages, CPU time (ns), the stamp
     it has done, calls repeated and wall time (ns). A parent that reads while the worker writes may see counts of two

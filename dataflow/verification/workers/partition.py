@@ -9,7 +9,7 @@ from typing import Any
 from dataflow.graph.model import Graph
 from dataflow.graph.reach import with_makers
 from dataflow.records.reading import FiringLog
-from dataflow.verification.books import Books
+from dataflow.verification.record_totals import GraphRecordTotals
 from dataflow.verification.workers import slices
 from dataflow.verification.workers.slices import Slice
 
@@ -39,7 +39,7 @@ class Job:
 def planned(
     graph: Graph,
     log: FiringLog,
-    books: Books,
+    books: GraphRecordTotals,
     operators: Collection[str],
     *,
     held: Collection[str],

@@ -25,7 +25,7 @@ MOST_EARLY = 2
 _PR_SET_CHILD_SUBREAPER = 36
 
 
-class Started:
+class PrestartedWorker:
     """A worker: what it shares with its parent, and, once that is known, its number. It waits for `go`."""
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ def _await_end(pid: int) -> None:
         os.close(handle)
 
 
-def _spawn(workers: list[Started], variables: Mapping[str, str], python: str = sys.executable) -> Process:
+def _spawn(workers: list[PrestartedWorker], variables: Mapping[str, str], python: str = sys.executable) -> Process:
     """Starts the process of one worker; or one that forks itself for each, and ends: they are this process's then."""
     handed = [worker.handed() for worker in workers]
     slots = [",".join(map(str, each)) for each in handed]
@@ -101,12 +101,12 @@ class EarlyWorkers:
 
     def __init__(self, count: int) -> None:
         self._environment = environment(1)
-        self._waiting: list[Started] = []
+        self._waiting: list[PrestartedWorker] = []
         self._maker: Process | None = None
         if not _adopts(True):
             return
         with contextlib.suppress(OSError):  # a caller that needs one tries again, and reports the error
-            self._waiting = [Started() for _ in range(count)]
+            self._waiting = [PrestartedWorker() for _ in range(count)]
             if count == 1:
                 self._waiting[0].spawn(self._environment)
             else:
@@ -119,7 +119,7 @@ class EarlyWorkers:
             with contextlib.suppress(ChannelClosed):  # it has died: `take` finds that
                 worker.channel.send("import", **fields)
 
-    def take(self, threads: int) -> Started | None:
+    def take(self, threads: int) -> PrestartedWorker | None:
         """Returns one for libraries with so many threads; None where there is none."""
         wanted = environment(threads)
         if not self._waiting or any(self._environment[name] != wanted[name] for name in THREADS):

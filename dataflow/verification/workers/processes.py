@@ -24,7 +24,7 @@ from dataflow.supervision.core.report import OperatorCounts, RunFailed, Status, 
 from dataflow.supervision.interrupts import interrupts
 from dataflow.verification.workers.board import Board
 from dataflow.verification.workers.job_file import read_job_file, write_job_file
-from dataflow.verification.workers.prestart import LEAVE_WITHIN, EarlyWorkers, Started, as_bytes
+from dataflow.verification.workers.prestart import LEAVE_WITHIN, EarlyWorkers, PrestartedWorker, as_bytes
 
 LOOK_EVERY = 0.1
 SHOW_EVERY = 0.2
@@ -116,14 +116,20 @@ class _Worker:
     """One worker process, as its parent sees it."""
 
     def __init__(
-        self, number: int, call: Call, started: Started | None, threads: int, locate: Locate, env: Environment | None
+        self,
+        number: int,
+        call: Call,
+        started: PrestartedWorker | None,
+        threads: int,
+        locate: Locate,
+        env: Environment | None,
     ) -> None:
         """`started`: a process that waits already."""
         variables, python = {**environment(threads), **call.environment}, sys.executable
         if env is not None:
             variables, python = env.variables(variables), env.python
         if started is None:
-            started = Started()
+            started = PrestartedWorker()
             started.spawn(variables, python)
         self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None

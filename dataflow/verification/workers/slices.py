@@ -17,7 +17,7 @@ from dataflow.graph.model import Graph
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.supervision.core.report import OperatorCounts
-from dataflow.verification.books import Book, Books
+from dataflow.verification.record_totals import GraphRecordTotals, NodeRecordTotals
 
 LEAST_NS = 300_000_000
 """Work (ns) that is worth a separate slice."""
@@ -34,7 +34,7 @@ class Slice:
     end: int | None
 
 
-def divisible(graph: Graph, books: Books, work: Mapping[str, int]) -> list[str]:
+def divisible(graph: Graph, books: GraphRecordTotals, work: Mapping[str, int]) -> list[str]:
     """Chooses those of the operators in `work` whose calls may be divided, heaviest first.
 
     They are without state, worth dividing, and nothing has happened to them but calls.
@@ -84,7 +84,7 @@ def cut(records: Iterable[FiringRecord], amounts: Sequence[int], per_call: int) 
     return [Slice(begin, end) for begin, end in pairwise([None, *bounds, None])]
 
 
-def together(found: Sequence[Mapping[str, Any]], book: Book) -> Mapping[str, Any] | None:
+def together(found: Sequence[Mapping[str, Any]], book: NodeRecordTotals) -> Mapping[str, Any] | None:
     """Makes the verification (as on the wire) of an operator of those of its slices; None where they do not show that
     every call was repeated as recorded."""
     verifications = [Verification.from_wire(values) for values in found]
@@ -98,7 +98,7 @@ def together(found: Sequence[Mapping[str, Any]], book: Book) -> Mapping[str, Any
     return {**found[0], "firings": verified, "verified": verified, **more}
 
 
-def answer(books: Books, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
+def answer(books: GraphRecordTotals, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
     """Puts together what `answers` say of divided operators, as one answer more; names those to verify as a whole."""
     told: dict[str, Any] = {name: {} for name in ("operators", "work", "digests", "comparisons")}
     told |= {"stored": [], "reading": 0, "wall": 0.0}

@@ -13,7 +13,7 @@ from dataflow.messages.geometry import quaternion_to_matrix
 from dataflow.messages.scene_summary import (
     Row,
     SceneSummary,
-    Told,
+    SummaryRelation,
     agents_in_words,
     carriers_in_words,
     class_names,
@@ -42,7 +42,7 @@ _THIN = 0.05  # metres: least radius of a capsule
 
 @visualizer(SceneGraph, "graph", "space", "text")
 def scene_graph(canvas: Canvas, message: SceneGraph) -> None:
-    """Objects in space, a tree and a list of those relations that are worth telling."""
+    """Objects in space, a tree and a list of those relations that are worth showing."""
     activities = canvas.scene.remembered.get((_operator(canvas.stream), "activities"))
     told = summarize(message, activities)
     tree(canvas, message, told, activities)
@@ -159,7 +159,7 @@ def _agents(canvas: Canvas, message: SceneGraph, agents: Sequence[int], activiti
 
 
 def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: set[int]) -> None:
-    """Thin lines from each thing to what carries it, thicker ones with words for what else is told."""
+    """Thin lines from each thing to what carries it, thicker ones with words for other relations."""
     carried = [r for r in told.carriers.values() if r.object not in told.places and {r.subject, r.object} <= drawable]
     ends = [message.positions[[r.subject, r.object]] for r in carried]
     if _moved(canvas, "carried", ends):
@@ -173,9 +173,9 @@ def _lines(canvas: Canvas, message: SceneGraph, told: SceneSummary, drawable: se
         canvas.draw("space/relations", message.frame, lines)
 
 
-def _intentions(canvas: Canvas, message: SceneGraph, intentions: Sequence[Told]) -> None:
+def _intentions(canvas: Canvas, message: SceneGraph, intentions: Sequence[SummaryRelation]) -> None:
     """An arrow from each agent to its likeliest goals, the brighter the likelier, with the probability."""
-    likely: list[Told] = []
+    likely: list[SummaryRelation] = []
     for r in intentions:
         if r.score >= _LIKELY and sum(other.subject == r.subject for other in likely) < _GOALS:
             likely.append(r)

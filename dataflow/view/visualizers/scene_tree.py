@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from dataflow.messages import Activity, SceneGraph
-from dataflow.messages.scene_summary import SceneSummary, Told, class_names, doing, grouped, percent
+from dataflow.messages.scene_summary import SceneSummary, SummaryRelation, class_names, doing, grouped, percent
 from dataflow.messages.scene_summary import spaced as words_of
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas
@@ -148,7 +148,7 @@ def with_act(name: str, act: tuple[str, float] | None) -> str:
     return name if act is None else f"{name}: {words_of(act[0])}"
 
 
-def _ways(agent: int, told: SceneSummary) -> list[Told]:
+def _ways(agent: int, told: SceneSummary) -> list[SummaryRelation]:
     """The relations of an agent that are shown."""
     carrier = told.carriers.get(agent)
     related = [] if carrier is None or carrier.object in told.places else [carrier]

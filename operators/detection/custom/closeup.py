@@ -1,4 +1,4 @@
-"""The view that a refiner has of each box: a close-up of the image around it, and numbers that tell place and kind."""
+"""The view that a refiner has of each box: a close-up of the image around it, and numbers for place and kind."""
 
 from __future__ import annotations
 

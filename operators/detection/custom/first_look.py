@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.decode import find_boxes
 from operators.detection.decode import Candidates
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.weights import NetworkFileError, open_network
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class FirstStageDetections:
     """Holds what was found in an image, in its pixels, by falling score; the revealed inner maps (1, C, h, w) of the
     network; and how the image was fitted into its input."""
 
     found: Candidates
     inner: Sequence[NDArray[np.float32]]
-    fit: Fit
+    fit: ImageFit
 
 
-class FirstLook:
+class FirstStage:
     """Raises FileNotFoundError, or NetworkFileError for a file that is no detector or lacks its anchors."""
 
     def __init__(self, file: Path) -> None:
@@ -43,13 +43,13 @@ class FirstLook:
         """Lets the network give inner maps as well. Raises ModelError for a name that it does not have."""
         self.network = self.network.revealing(names)
 
-    def look(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Looked:
+    def look(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> FirstStageDetections:
         """Finds the best `most` boxes in an image (H, W, 3), RGB.
 
         Raises NetworkFileError where the network's output is not what its metadata say.
         """
         network = self.network
-        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), network.size)
+        fit = ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), network.size)
         outputs = network.run(fit.apply(pixels))
         levels = len(self._strides)
         try:
@@ -58,4 +58,4 @@ class FirstLook:
             )
         except ValueError as error:
             raise NetworkFileError(f"{network.file} does not fit its metadata: {error}") from None
-        return Looked(replace(found, boxes=fit.restore(found.boxes)), outputs[levels:], fit)
+        return FirstStageDetections(replace(found, boxes=fit.restore(found.boxes)), outputs[levels:], fit)

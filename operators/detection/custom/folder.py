@@ -1,4 +1,4 @@
-"""Reads labelled images from a folder, in COCO or YOLO format as its files tell."""
+"""Reads labelled images from a folder, in COCO or YOLO format by its files."""
 
 from __future__ import annotations
 

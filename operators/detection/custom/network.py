@@ -20,7 +20,7 @@ ANCHORS_PER_CELL = 3
 class GridHead(nn.Module):
     """Feature maps by stride → one map (N, A · (5 + C), H, W) for each of `strides`, by a feature pyramid.
 
-    What the channels mean is told in `operators.detection.custom.decode`.
+    The meaning of the channels is in `operators.detection.custom.decode`.
     """
 
     def __init__(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.closeup import closeups, moved, numbers, places, windows
-from operators.detection.custom.first_look import FirstLook, Looked
+from operators.detection.custom.first_look import FirstStage, FirstStageDetections
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms
@@ -24,7 +24,7 @@ Answer = Callable[[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]],
 
 
 @dataclass(frozen=True)
-class Look:
+class RefinerSettings:
     """Settings of a second look, at the best `most` boxes of `classes` classes that score at least `least`: close-ups
     have `side` pixels along a side."""
 
@@ -36,15 +36,15 @@ class Look:
 
 class Refiner:
     """A small network that sees the close-up of each box in the image's full resolution, and what the detector's inner
-    maps tell of its surroundings.
+    maps show of its surroundings.
 
-    It moves the four sides; scores stay. One network for all classes, which is told the class. Method: Cai and
+    It moves the four sides; scores stay. One network for all classes, with the class as input. Method: Cai and
     Vasconcelos, "Cascade R-CNN", 2018: a second regression, from the boxes of the first.
     """
 
     def __init__(self, second: SecondNetwork, network: Network) -> None:
         facts, side = second.facts, int(second.facts["side"])
-        self.look = Look(len(facts["classes"]), side, float(facts["least_score"]), int(facts["most_boxes"]))
+        self.look = RefinerSettings(len(facts["classes"]), side, float(facts["least_score"]), int(facts["most_boxes"]))
         self.maps = inner_names(network, facts["maps"])
         self._second = second
         around = second.inputs.get("surroundings", ("", [0]))[1]
@@ -62,7 +62,7 @@ class Refiner:
         second = open_second(network, KIND, ("side", "least_score", "most_boxes", "maps"))
         return None if second is None else cls(second, network)
 
-    def refined(self, pixels: NDArray[np.uint8], looked: Looked, nms_iou: float) -> Candidates:
+    def refined(self, pixels: NDArray[np.uint8], looked: FirstStageDetections, nms_iou: float) -> Candidates:
         """The boxes in the pixels of an image (H, W, 3), RGB, after a second look, by falling score.
 
         Those that score less than `look.least`, and all but the best `look.most`, stay as they are. Boxes of a class
@@ -84,7 +84,7 @@ class GridFinder:
     """
 
     def __init__(self, file: Path) -> None:
-        self._look = FirstLook(file)
+        self._look = FirstStage(file)
         self.names: tuple[str, ...] = self._look.network.classes
         self._refiner = Refiner.within(self._look.network)
         if self._refiner is not None:
@@ -106,7 +106,9 @@ def inner_names(network: Network, names: Sequence[str]) -> list[str]:
     return [f"{name}{ending}" for name in names]
 
 
-def look_again(answer: Answer, pixels: NDArray[np.uint8], looked: Looked, look: Look, nms_iou: float) -> Candidates:
+def look_again(
+    answer: Answer, pixels: NDArray[np.uint8], looked: FirstStageDetections, look: RefinerSettings, nms_iou: float
+) -> Candidates:
     """`Refiner.refined`, by what `answer` gives."""
     found = looked.found
     count = min(look.most, int(np.count_nonzero(found.scores >= look.least)))

@@ -18,9 +18,9 @@ from torch.nn import functional
 from operators.detection.custom.closeup import MARGIN, PIXELS, closeups, numbers, places, windows
 from operators.detection.custom.dataset import DetectionData, LabelledImage
 from operators.detection.custom.evaluation import ScoredImage, score_detections
-from operators.detection.custom.first_look import FirstLook
+from operators.detection.custom.first_look import FirstStage
 from operators.detection.custom.loss import complete_iou
-from operators.detection.custom.refiner import DEQUANTIZED, KIND, Look, inner_names, look_again
+from operators.detection.custom.refiner import DEQUANTIZED, KIND, RefinerSettings, inner_names, look_again
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.nms import intersection_over_union
 from operators.learning.augmentation import Variation, recolored
@@ -50,7 +50,7 @@ class RefinerNetwork(nn.Module):
     """Close-ups (N, S, S, 3) uint8, surroundings (N, A) and places (N, F) → sides (N, 4), shares of the window.
 
     Every side is seen as if it were the left one: the half of the close-up beside it, fine across the side and coarse
-    along it, and the whole, coarse. So one set of weights learns from all four sides. The surroundings tell them apart.
+    along it, and the whole, coarse. So one set of weights learns from all four sides. The surroundings differ.
     """
 
     def __init__(self, classes: int, side: int, around: int) -> None:
@@ -116,13 +116,13 @@ class RefinerTask(SecondTask[LabelledImage, Batch]):
     def __init__(
         self, data: DetectionData, file: Path, *, seed: int = 0, variation: Variation | None = None, side: int = SIDE
     ) -> None:
-        self._first = FirstLook(file)
+        self._first = FirstStage(file)
         network = self._first.network
         super().__init__(data, file, network.classes, seed, variation)
         self.side = side
         self._maps = maps_of(file)
         self._first.reveal(inner_names(network, self._maps))
-        self._again = Look(len(data.classes), side, LEAST, MOST)
+        self._again = RefinerSettings(len(data.classes), side, LEAST, MOST)
         self._gather(max(1, min(_SHOWN, _ROWS // len(data.training))), seed)
         self._around = self._rows[1].shape[1]
         self.network = RefinerNetwork(len(data.classes), side, self._around)

@@ -1,4 +1,4 @@
-"""Samples of a detector's own inner maps on a grid over the window of a box: they tell of its surroundings."""
+"""Samples of a detector's own inner maps on a grid over the window of a box: they describe its surroundings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 
 F32 = NDArray[np.float32]
 GRID = 6
@@ -17,7 +17,7 @@ _TOGETHER = 8  # windows whose samples stay in the processor's cache
 Samples = NDArray[np.float64]
 
 
-def surroundings(maps: Sequence[F32], seen: F32, fit: Fit) -> F32:
+def surroundings(maps: Sequence[F32], seen: F32, fit: ImageFit) -> F32:
     """Samples (N, M * GRID * GRID * C) of M inner maps (1, C, h, w) over windows (N, 4) in pixels of the image.
 
     Where samples lie far apart, they are taken from a map of which two by two cells, or four by four, are one.

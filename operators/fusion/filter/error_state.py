@@ -85,18 +85,24 @@ def log_rotation(R: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Wander:
+class GaussMarkovProcess:
     """Holds how lasting errors of sensors change: rates of decay (K,) in 1/s, noise (K,) in their unit/√s."""
 
     decay: Array = field(default_factory=lambda: np.zeros(0))
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
-STEADY = Wander()
+STEADY = GaussMarkovProcess()
 
 
 def propagated(
-    state: State, gyro: Array, accel: Array, seconds: float, noise: Noise, gravity: Array, wander: Wander = STEADY
+    state: State,
+    gyro: Array,
+    accel: Array,
+    seconds: float,
+    noise: Noise,
+    gravity: Array,
+    wander: GaussMarkovProcess = STEADY,
 ) -> State:
     """Moves the state by the mean readings (rad/s, m/s²) of a short time; `gravity` (3,) in m/s²."""
     dt = seconds

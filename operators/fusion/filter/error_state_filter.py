@@ -30,7 +30,16 @@ from operators.fusion.filter.error_state import (
     shifted,
     updated,
 )
-from operators.fusion.filter.gate import PLACES, Doubt, GateConfig, Health, judge, leap, repeat_of, threshold
+from operators.fusion.filter.gate import (
+    PLACES,
+    GateConfig,
+    Health,
+    RejectedMeasurement,
+    judge,
+    leap,
+    repeat_of,
+    threshold,
+)
 from operators.fusion.filter.history import Command, Entry, Hypothesis, Node, Restart, Sample
 from operators.fusion.filter.hypotheses import combined, doubted, likely, moves, reduced, refuted, with_errors
 from operators.fusion.filter.measurements import Measurement
@@ -122,20 +131,20 @@ class ErrorStateFilter(Remembered):
 
     @property
     def hypotheses(self) -> int:
-        """Returns how many headings are in question: one where it was told, until that is refuted."""
+        """Returns how many headings are in question: one where it was given, until that is refuted."""
         node = self._newest()
         told = any(h.against for h in node.hypotheses) and not node.refuted
         return 1 if told else len(likely(node.hypotheses))
 
     @property
     def doubted_heading(self) -> bool:
-        """Returns whether what was told of the first heading may be wrong, though it is not refuted."""
+        """Returns whether the given first heading may be wrong, though it is not refuted."""
         node = self._newest()
         return node.doubted and not node.refuted
 
     @property
     def refuted_heading(self) -> bool:
-        """Returns whether what was measured contradicts what was told of the first heading, of late."""
+        """Returns whether recent measurements contradict the given first heading."""
         node = self._newest()
         return node.refuted and node.moving < _STANDS
 
@@ -290,7 +299,7 @@ class ErrorStateFilter(Remembered):
         return replace(node, time=time, hypotheses=hypotheses, gyro=gyro, accel=accel, moving=moving, window=window)
 
     def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
-        """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
+        """Goes on at the same velocities, or those that were commanded: what is felt is gravity alone."""
         steps = max(1, math.ceil(seconds / 0.05))
         turning = gyro if self._config.inertial else np.zeros(3)
         for k in range(steps):
@@ -314,7 +323,7 @@ class ErrorStateFilter(Remembered):
             hypotheses = _brought(hypotheses, found)
             found, scores, best = self._found(entry, hypotheses, node)
         health = replace(health, repeat=repeat_of(health.repeat, entry, state, fits))
-        doubt = Doubt(entry.time, residual, entry.noise, kind)
+        doubt = RejectedMeasurement(entry.time, residual, entry.noise, kind)
         unfelt = self._config.unfelt
         nis = scores[best][0]
         leapt = 0.0 if unfelt is None else leap(config, entry.sensor, doubt, node.health, state, H, nis, unfelt)

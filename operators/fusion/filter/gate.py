@@ -64,7 +64,7 @@ class Repeat:
 
 
 @dataclass(frozen=True, eq=False)
-class Doubt:
+class RejectedMeasurement:
     """A measurement that was not believed: its time (ns), residual (M,), covariance (M, M), and its model's name."""
 
     time: int
@@ -88,7 +88,7 @@ class Health:
     unconfirmed: int = 0
     last_used: int | None = None
     nis: float = 1.0
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[RejectedMeasurement, ...] = ()
     nis_sum: float = 0.0
     freedom: int = 0
     streak: int = 0
@@ -112,7 +112,7 @@ class Health:
         return self.frozen or self.streak >= (2 if self.leap else 3)
 
     def after(
-        self, verdict: Verdict, time: int, nis: float, doubt: Doubt, config: GateConfig, leap: float = 0.0
+        self, verdict: Verdict, time: int, nis: float, doubt: RejectedMeasurement, config: GateConfig, leap: float = 0.0
     ) -> Health:
         """Returns the health after a verdict on a measurement with a normalised innovation squared."""
         freedom = len(doubt.residual)
@@ -138,8 +138,8 @@ def threshold(share: float, freedom: int) -> float:
 
 def judge(
     config: GateConfig,
-    doubts: Sequence[Doubt],
-    doubt: Doubt,
+    doubts: Sequence[RejectedMeasurement],
+    doubt: RejectedMeasurement,
     state: State,
     H: Array,
     normalised: float,
@@ -170,7 +170,7 @@ def judge(
 def leap(
     config: GateConfig,
     sensor: str,
-    doubt: Doubt,
+    doubt: RejectedMeasurement,
     health: Mapping[str, Health],
     state: State,
     H: Array,
@@ -209,7 +209,7 @@ def leap(
     return 0.0 if size and _witnessed(config, sensor, doubt, health) else size
 
 
-def _beside(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[str, Health]) -> float:
+def _beside(config: GateConfig, sensor: str, doubt: RejectedMeasurement, health: Mapping[str, Health]) -> float:
     """Returns by how much the same device has leapt lately under another name, 0 if it has not."""
     device = sensor.partition(" ")[0]
     return max(
@@ -227,7 +227,9 @@ def _squared(residual: Array, covariance: Array) -> float:
     return float(residual @ np.linalg.solve(covariance, residual))
 
 
-def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleration: float, seconds: float) -> bool:
+def _leaps(
+    config: GateConfig, doubt: RejectedMeasurement, state: State, H: Array, acceleration: float, seconds: float
+) -> bool:
     """Returns whether a measurement does not fit even an inertial sensor that erred by an acceleration (m/s², σ).
 
     It may have erred for the `seconds` since the sensor was last believed.
@@ -240,7 +242,7 @@ def _leaps(config: GateConfig, doubt: Doubt, state: State, H: Array, acceleratio
     return _squared(doubt.residual, S) > threshold(config.share, len(doubt.residual))
 
 
-def _witnessed(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[str, Health]) -> bool:
+def _witnessed(config: GateConfig, sensor: str, doubt: RejectedMeasurement, health: Mapping[str, Health]) -> bool:
     """Returns whether another sensor's refused positions, of another kind, agree with this one."""
     if doubt.kind not in PLACES:
         return False
@@ -262,7 +264,7 @@ def _witnessed(config: GateConfig, sensor: str, doubt: Doubt, health: Mapping[st
     return False
 
 
-def _agree(config: GateConfig, before: Doubt, now: Doubt, state: State, H: Array) -> bool:
+def _agree(config: GateConfig, before: RejectedMeasurement, now: RejectedMeasurement, state: State, H: Array) -> bool:
     seconds = abs(now.time - before.time) * 1e-9
     if seconds > config.memory or len(before.residual) != len(now.residual):
         return False

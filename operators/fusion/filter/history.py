@@ -30,7 +30,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """A control input in the place of inertial samples: velocities that a body was told at a time (ns).
+    """A control input in the place of inertial samples: velocities that were commanded at a time (ns).
 
     They are linear (3,) in m/s and angular (3,) in rad/s, in its own axes, are followed with the time constant `lag`
     (s), and hold for `lasts` (ns).
@@ -78,7 +78,7 @@ Entry = Sample | Measurement | Command | Restart
 class Hypothesis:
     """One of several estimates, with the logarithm of its weight.
 
-    `against`: what was told of the first heading, which it is followed against for a time in motion.
+    `against`: the given first heading, against which it is followed for a time in motion.
     """
 
     weight: float
@@ -90,7 +90,7 @@ class Hypothesis:
 class Node:
     """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor.
 
-    `refuted`: measurements contradict what was told of the first heading; `doubted`: it may be wrong; `moving`:
+    `refuted`: measurements contradict the given first heading; `doubted`: it may be wrong; `moving`:
     nanoseconds in motion so far; `window`: what was felt and measured of late.
     """
 

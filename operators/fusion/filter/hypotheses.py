@@ -16,7 +16,7 @@ _LIKELY = 5.0
 _FOLLOWED = 20_000_000_000
 """Nanoseconds in motion for which headings are followed against the one told: nothing shows a heading at rest."""
 _DOUBTED, _TRUSTED = 0.03, 0.01
-"""Probability that what was told of the first heading is wrong, from which it is in question, and until which. Headings
+"""Probability that the given first heading is wrong, from which it is in question, and until which. Headings
 against it begin with 0.01 in all: by Ville's inequality a right one comes into question once in three times at most."""
 
 
@@ -41,7 +41,7 @@ def likely(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def refuted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
-    """Returns whether what was told of the first heading is refuted: by the best hypothesis, and from then on
+    """Returns whether the given first heading is refuted: by the best hypothesis, and from then on
     (`before`) until none of the likely ones is against it.
     """
     best = max(hypotheses, key=lambda h: h.weight)
@@ -49,7 +49,7 @@ def refuted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
 
 
 def doubted(hypotheses: Sequence[Hypothesis], before: bool) -> bool:
-    """Returns whether what was told of the first heading is in question; `before`: it was."""
+    """Returns whether the given first heading is in question; `before`: it was."""
     best = max(h.weight for h in hypotheses)
     chances = [(math.exp(h.weight - best), h.against) for h in hypotheses]
     wrong = sum(chance for chance, against in chances if against) / sum(chance for chance, _ in chances)

@@ -98,7 +98,7 @@ def first_node(
     even = math.pi / prior.headings
     last = samples[-1]
     headings = [(heading, even, 0.0, False) for heading in around]
-    if known:  # it may have been told wrongly: the others are followed for a while too
+    if known:  # it may be wrong: the others are followed for a while too
         headings = [(centre, prior.heading_sigma, 0.0, False)]
         if prior.heading_sigma < even:
             headings += [(heading, even, _MISTOLD, True) for heading in around[1:]]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.fusion.filter.error_state import SIZE, State, Wander
+from operators.fusion.filter.error_state import SIZE, GaussMarkovProcess, State
 from operators.fusion.filter.measurements import FullPose, Model, Position, Velocity
 
 Array = NDArray[np.float64]
@@ -40,14 +40,16 @@ class SensorErrors:
         return [*(sigma for _, sigma in self.clocks), *moved, *(sigma for _, sigma in self.scales)]
 
     @property
-    def wander(self) -> Wander:
+    def wander(self) -> GaussMarkovProcess:
         """Returns how they change."""
         decay = [0.0] * len(self.clocks)
         noise = [_CLOCK_WALK] * len(self.clocks)
         for _, sigmas, seconds in self.drifts:
             decay += [1.0 / seconds] * 3
             noise += [sigma * math.sqrt(2.0 / seconds) for sigma in sigmas]
-        return Wander(np.array(decay + [0.0] * len(self.scales)), np.array(noise + [0.0] * len(self.scales)))
+        return GaussMarkovProcess(
+            np.array(decay + [0.0] * len(self.scales)), np.array(noise + [0.0] * len(self.scales))
+        )
 
     def taken_off(self, sensor: str, model: Model, state: State, residual: Array, J: Array) -> Array:
         """Returns the residual (M,) without the drift or scale that a sensor is believed to have.

@@ -66,7 +66,7 @@ _MOMENT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class WindowFit:
     """Holds the motion that fits a window best: the state at its first step, and sensors' errors (S,).
 
     `cost`: squared residuals by their covariance; `sigmas` (S,) of the errors; `freedom`: how many were measured;
@@ -96,7 +96,7 @@ class Suspicions(Remembered):
     _looked: int
     _found: tuple[str, str, float, float] | None
     _suspected: list[tuple[str, str]]
-    _fits: list[Fit]  # without errors, and with them
+    _fits: list[WindowFit]  # without errors, and with them
 
     def __init__(self, known: SensorErrors, gravity: Array, biases: tuple[float, float]) -> None:
         self._known, self._gravity = known, gravity
@@ -108,10 +108,10 @@ class Suspicions(Remembered):
         """Returns sensor, kind, size and standard deviation (s, or a share) of the error that explains most, if any."""
         return self._found
 
-    def look(self, time: int, window: Window, sure: bool = True) -> Fit | None:
+    def look(self, time: int, window: Window, sure: bool = True) -> WindowFit | None:
         """Looks, once a second; returns the motion of late, None if it was not fitted or if speeds are wrong.
 
-        `sure`: nothing contradicts what was told of the first heading.
+        `sure`: nothing contradicts the given first heading.
         """
         if time - self._looked < _EVERY:
             return None
@@ -146,14 +146,14 @@ class Suspicions(Remembered):
         }
         return sorted(every - estimated)
 
-    def _judged(self, without: Fit, erring: Fit, enough: float) -> tuple[str, str, float, float] | None:
-        noise = max(erring.cost / erring.freedom, 1.0)  # what was told of it may be too small
+    def _judged(self, without: WindowFit, erring: WindowFit, enough: float) -> tuple[str, str, float, float] | None:
+        noise = max(erring.cost / erring.freedom, 1.0)  # the given noise may be too small
         if without.cost - erring.cost < enough * noise or not erring.explains:
             return None
         k = int(np.argmax(np.abs(erring.errors) / erring.sigmas))
         return *self._suspected[k], float(erring.errors[k]), float(erring.sigmas[k])
 
-    def _fitted(self, window: Window, erring: bool) -> Fit:
+    def _fitted(self, window: Window, erring: bool) -> WindowFit:
         """Returns the motion that explains a window best, with errors of sensors or without."""
         steps = window.steps[window.first :]
         state, errors = self._begun(window, erring)
@@ -178,7 +178,7 @@ class Suspicions(Remembered):
         known = effects[:SIZE, :size]
         covariance = end.covariance + known @ np.linalg.solve(information[:size, :size], known.T)
         end = moved(end, known @ change, covariance)
-        return Fit(steps[0].time, state, errors, cost, sigmas, freedom, steps[-1].time, end, promise)
+        return WindowFit(steps[0].time, state, errors, cost, sigmas, freedom, steps[-1].time, end, promise)
 
     def _begun(self, window: Window, erring: bool) -> tuple[State, Array]:
         """Returns the state at the window's first step and the errors (S,) from which a fit begins."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Unusable(Exception):
+class UnusableMessage(Exception):
     """Raised for a message that is ignored; the text names the reason."""
 
 
@@ -33,16 +33,16 @@ def white_part(covariance: Array, drift: Sequence[float]) -> Array:
 
 
 def positive(covariance: Array) -> Array:
-    """Returns the covariance, symmetric. Raises Unusable for what is none."""
+    """Returns the covariance, symmetric. Raises UnusableMessage for what is none."""
     if not np.isfinite(covariance).all():
-        raise Unusable("covariance not finite")
+        raise UnusableMessage("covariance not finite")
     symmetric = np.asarray(0.5 * (covariance + covariance.T))
     if float(np.linalg.eigvalsh(symmetric)[0]) <= 0:
-        raise Unusable("covariance not positive")
+        raise UnusableMessage("covariance not positive")
     return symmetric
 
 
 def check_finite(*values: Array) -> None:
-    """Raises Unusable for values that are not finite."""
+    """Raises UnusableMessage for values that are not finite."""
     if not all(np.isfinite(v).all() for v in values):
-        raise Unusable("not finite")
+        raise UnusableMessage("not finite")

@@ -15,7 +15,7 @@ from operators.fusion.filter.gate import threshold
 from operators.fusion.filter.history import Node, Sample
 from operators.fusion.filter.initialisation import Prior, first_node, rests
 from operators.fusion.filter.measurements import FullPose, Model, Position, Velocity
-from operators.fusion.sensors.covariances import Unusable
+from operators.fusion.sensors.covariances import UnusableMessage
 
 Array = NDArray[np.float64]
 _LONGEST = 0.1
@@ -58,16 +58,16 @@ class InertialSensor(Remembered):
     def sample(self, name: str, imu: Imu, time: int) -> Sample:
         """Returns the sample of a message that was measured at a time (ns).
 
-        Raises Unusable for readings that are not finite or all zero (a sensor that is off: at rest there is gravity, in
-        free fall there is noise), and for a sample not later than the last, ValueError where
-        the noise of the samples is unspecified.
+        Raises UnusableMessage for readings that are not finite or all zero (a sensor that is off: at rest there is
+        gravity, in free fall there is noise), and for a sample not later than the last, ValueError where the noise of
+        the samples is unspecified.
         """
         if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
-            raise Unusable("not finite")
+            raise UnusableMessage("not finite")
         if not (imu.angular_velocity.any() or imu.linear_acceleration.any()):
-            raise Unusable("all zero")
+            raise UnusableMessage("all zero")
         if time <= self._last:
-            raise Unusable("stamp not later than the last")
+            raise UnusableMessage("stamp not later than the last")
         noise = self._noise_of(name, imu, time)
         if self._first < 0:
             self._first = time

@@ -32,7 +32,7 @@ from operators.fusion.filter.measurements import (
     Range,
     Velocity,
 )
-from operators.fusion.sensors.covariances import Unusable, check_finite, covariance_of, positive, white_part
+from operators.fusion.sensors.covariances import UnusableMessage, check_finite, covariance_of, positive, white_part
 from operators.fusion.sensors.settings import SensorSettings, use_of
 from operators.geometry import se3
 from operators.geometry.geodesy import east_north_up
@@ -43,7 +43,7 @@ _I3 = np.eye(3)
 
 
 @dataclass
-class Surroundings:
+class MeasurementContext:
     """Holds what measurements are related to: places of sensors on the body, the world's frame, origin and landmarks.
 
     `ignored` counts what is passed over of a message whose rest serves.
@@ -57,11 +57,11 @@ class Surroundings:
 
 
 def measurements(
-    name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
+    name: str, message: Message, before: Message | None, settings: SensorSettings, around: MeasurementContext
 ) -> Iterator[Found]:
     """Yields (time, sensor, model, covariance) of a message; `before` is the sensor's last.
 
-    Raises Unusable for a message without use, ValueError for one that its settings do not fit.
+    Raises UnusableMessage for a message without use, ValueError for one that its settings do not fit.
     """
     use = use_of(name, message, settings)
     time = message.stamp - round(settings.offset * 1e9)
@@ -77,7 +77,7 @@ def measurements(
         measured = around.place(message.frame)[:3, :3] @ message.field
         check_finite(measured)
         if not measured.any():
-            raise Unusable("no field")
+            raise UnusableMessage("no field")
         sigma = settings.angular_sigma or 0.1
         yield time, name, MagneticHeading(measured, settings.azimuth), np.array([[sigma**2]])
     elif isinstance(message, RadarScan) and use == "doppler":
@@ -86,9 +86,9 @@ def measurements(
         yield from _ranges(time, name, message, settings, around)
 
 
-def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundings) -> tuple[Model, Array]:
+def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: MeasurementContext) -> tuple[Model, Array]:
     if fix.status == "no_fix":
-        raise Unusable("no fix")
+        raise UnusableMessage("no fix")
     check_finite(np.array([fix.latitude, fix.longitude]))
     if around.origin is None:
         around.origin = (fix.latitude, fix.longitude, fix.altitude if math.isfinite(fix.altitude) else 0.0)
@@ -103,11 +103,11 @@ def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundin
 
 
 def _absolute(
-    name: str, use: str, message: Message, settings: SensorSettings, around: Surroundings
+    name: str, use: str, message: Message, settings: SensorSettings, around: MeasurementContext
 ) -> tuple[Model, Array]:
     if isinstance(message, Imu):
         if message.orientation is None:
-            raise Unusable("no orientation")
+            raise UnusableMessage("no orientation")
         check_finite(message.orientation)
         R = quaternion_to_matrix(message.orientation) @ around.place(message.frame)[:3, :3].T
         C = covariance_of(name, message.orientation_covariance, settings.angular_sigma, "angular_sigma")
@@ -150,28 +150,28 @@ def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array,
     if message.linear is not None and message.angular is not None:
         return 0, message.linear, message.angular, message.twist_covariance
     if not isinstance(before, Odometry) or before.frame != message.frame:
-        raise Unusable("first of its kind")
+        raise UnusableMessage("first of its kind")
     span = message.stamp - before.stamp
     if not np.isfinite(before.position).all() or not np.isfinite(message.position).all():
-        raise Unusable("not finite")
+        raise UnusableMessage("not finite")
     step = se3.log(invert(before.matrix()) @ message.matrix()) / (span * 1e-9)
     return span // 2, step[:3], step[3:], None
 
 
-def turning(message: Message, before: Message | None, around: Surroundings) -> Array | None:
-    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they tell."""
+def turning(message: Message, before: Message | None, around: MeasurementContext) -> Array | None:
+    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they hold it."""
     if not isinstance(message, Odometry | Twist):
         return None
     try:
         _, _, angular, _ = _twist(message, before)
-    except Unusable:
+    except UnusableMessage:
         return None
     frame = message.child_frame if isinstance(message, Odometry) else message.frame
     return np.asarray(around.place(frame)[:3, :3] @ angular)
 
 
 def _velocity(
-    time: int, name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
+    time: int, name: str, message: Message, before: Message | None, settings: SensorSettings, around: MeasurementContext
 ) -> Iterator[Found]:
     half, linear, angular, given = _twist(message, before)
     check_finite(linear, angular)
@@ -193,7 +193,9 @@ def _metric(message: Message) -> bool:
     return given is None or bool(np.isfinite(np.diag(given)[:3]).any())
 
 
-def _wheels(time: int, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:
+def _wheels(
+    time: int, name: str, message: Message, settings: SensorSettings, around: MeasurementContext
+) -> Iterator[Found]:
     """Forward speed, no slip aside or upwards, and rest when the wheels stand."""
     half, linear, angular, given = _twist(message, None)
     check_finite(linear, angular)
@@ -209,9 +211,11 @@ def _wheels(time: int, name: str, message: Message, settings: SensorSettings, ar
     yield time - half, name, Velocity(np.array([linear[0], 0.0, 0.0]), axes, lever), C
 
 
-def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:
+def _doppler(
+    time: int, name: str, scan: RadarScan, settings: SensorSettings, around: MeasurementContext
+) -> Iterator[Found]:
     if scan.velocities is None:
-        raise Unusable("no Doppler velocities")
+        raise UnusableMessage("no Doppler velocities")
     T_body_radar = around.place(scan.frame)
     a = scan.azimuths.astype(np.float64)
     e = np.zeros_like(a) if scan.elevations is None else scan.elevations.astype(np.float64)
@@ -226,16 +230,16 @@ def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, ar
 
 
 def _ranges(
-    time: int, name: str, sightings: LandmarkSightings | RadarScan, settings: SensorSettings, around: Surroundings
+    time: int, name: str, sightings: LandmarkSightings | RadarScan, settings: SensorSettings, around: MeasurementContext
 ) -> Iterator[Found]:
     """Distances to identified landmarks, for a radar by the `ids` of its detections."""
     if sightings.ranges is None:
-        raise Unusable("no ranges")
+        raise UnusableMessage("no ranges")
     if sightings.ids is None:
-        raise Unusable("no identities")
+        raise UnusableMessage("no identities")
     covariances = sightings.covariances if isinstance(sightings, LandmarkSightings) else None
     if around.landmarks is None or around.landmarks.positions is None:
-        raise Unusable("no map of landmarks")
+        raise UnusableMessage("no map of landmarks")
     if around.landmarks.positions.shape[1] != 3:
         raise ValueError(f"{name}: the map of landmarks is planar, and ranges are measured in space")
     places = dict(zip(around.landmarks.ids.tolist(), around.landmarks.positions, strict=True))
@@ -245,9 +249,9 @@ def _ranges(
         try:
             noise = covariance_of(name, C, settings.sigma, "sigma")[:1, :1]
             if identity not in places:
-                raise Unusable("landmark not in the map")
+                raise UnusableMessage("landmark not in the map")
             check_finite(np.array([distance]), places[identity])
-        except Unusable as reason:
+        except UnusableMessage as reason:
             around.ignored[f"{name}: {reason}"] += 1
         else:
             yield time, name, Range(np.array([distance]), places[identity], lever), noise

@@ -1,4 +1,4 @@
-"""The beams of a scan, which tell a surface from points that happen to lie in a plane."""
+"""The beams of a scan, which distinguish a surface from points that happen to lie in a plane."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class Pairs:
 
     `points` (M,) are indices; `centers` and `normals` (M, 3) in the map's frame; `thickness` (M,) is the variance of
     the plane's points about it, m²; `slopes` (M,) that of the normal's direction, rad²; `births` (M,) is when the plane
-    was first seen, as `add` was told; `known` is the share of all points in voxels that hold enough points to tell.
+    was first seen, as given to `add`; `known` is the share of all points in voxels that hold enough points.
     """
 
     points: Rows

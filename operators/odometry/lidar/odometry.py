@@ -33,7 +33,7 @@ class Sweep(BaseModel):
     period: float = Field(gt=0, le=10, description="seconds that a turn takes")
     begins: float = Field(0.0, description="azimuth at which it begins, radians from x towards y")
     clockwise: bool = Field(False, description="seen from above")
-    stamped: Literal["begin", "middle", "end"] = Field("end", description="moment of the turn that stamps tell")
+    stamped: Literal["begin", "middle", "end"] = Field("end", description="moment of the turn that stamps give")
 
     def offsets(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns when each of the points (N, 3) was measured after the stamp (N,), seconds; NaN where a point is.

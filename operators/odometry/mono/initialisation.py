@@ -10,7 +10,7 @@ from operators.odometry.mono.map import MonoMap, View, found_in
 from operators.odometry.mono.scale import FEWEST_METRES, Scale, way
 from operators.odometry.mono.settings import MonoOdometryConfig
 from operators.odometry.mono.tracks import MonoFrame, Tracks
-from operators.odometry.mono.two_view import Unsolved, two_views
+from operators.odometry.mono.two_view import TwoViewFailure, two_views
 
 ROUNDS = 15  # of the first adjustment
 
@@ -26,14 +26,14 @@ class Beginning:
 
 def first_map(
     frame: MonoFrame, first: View, tracks: Tracks, covariance: Matrix, config: MonoOdometryConfig
-) -> Beginning | Unsolved:
+) -> Beginning | TwoViewFailure:
     """Returns the map that a frame and an earlier view of its corners give, or why they give none.
 
     The unit is a metre where both know how far the camera came, and else the depth of the median point.
     """
     rows, _ = found_in(first.numbers, tracks.numbers)
     found = two_views(first.pixels[rows], tracks.pixels, frame.K, config.two_view)
-    if isinstance(found, Unsolved):
+    if isinstance(found, TwoViewFailure):
         return found
     T_first = first.T_world_camera
     second = Tracks(frame.gray, T_first @ invert(found.T_second_first), tracks.numbers, tracks.pixels)
@@ -42,7 +42,7 @@ def first_map(
     begun, wrong = begun.adjusted(frame.K, config.sigma, config.window, 1, ROUNDS)
     begun = begun.without(wrong)
     if len(begun.numbers) < max(0.7 * config.two_view.min_points, config.min_inliers):
-        return Unsolved.DISAGREE
+        return TwoViewFailure.DISAGREE
     begun, scale = _measured(begun, config)
     kept = second.only(~np.isin(second.numbers, wrong))
     return Beginning(begun, scale, Tracks(frame.gray, begun.newest.T_world_camera, kept.numbers, kept.pixels))

@@ -24,7 +24,7 @@ from operators.odometry.mono.ranging import MetricDepth, Ranged, RangingMemory, 
 from operators.odometry.mono.scale import Scale
 from operators.odometry.mono.settings import MonoOdometryConfig
 from operators.odometry.mono.tracks import MonoFrame, Tracks, from_view, observe
-from operators.odometry.mono.two_view import Unsolved
+from operators.odometry.mono.two_view import TwoViewFailure
 from operators.odometry.motion import Motion
 from operators.odometry.tracking import Status, TrackResult, moved_covariance, scaled_covariance
 
@@ -142,7 +142,7 @@ class MonoOdometry:
             few = len(tracks.numbers) < fewest
             return f"{len(tracks.numbers)} corners: the view has too little texture" if few else "the first view"
         begun = first_map(frame, first, tracks, state.covariance, config)
-        if isinstance(begun, Unsolved):
+        if isinstance(begun, TwoViewFailure):
             return str(begun)
         motion = Motion(frame.stamp, begun.tracks.T_world_camera, np.zeros(6))
         origin = first.T_world_camera[:3, 3]

@@ -1,6 +1,6 @@
 """Two views of an unknown scene: the motion that explains how corners went from one to the other, and their points.
 
-An essential matrix and a homography compete, and what neither can tell is named instead of guessed: a camera that has
+An essential matrix and a homography compete, and what neither can determine is named, not guessed: a camera that has
 only turned, a view that hardly changed, a plane that allows two motions. Mur-Artal et al., "ORB-SLAM", 2015, IV.
 """
 
@@ -25,7 +25,7 @@ TURNING = 2.0  # sigmas by which corners are off in the median where a rotation 
 SHARP = 0.3  # share of the corners that must become points
 
 
-class Unsolved(StrEnum):
+class TwoViewFailure(StrEnum):
     """Reasons for which two views do not determine a motion."""
 
     FEW = "too few corners are seen by both views"
@@ -63,24 +63,24 @@ class TwoViews:
     planar: bool  # whether a homography explained them
 
 
-def two_views(first: Pixels, second: Pixels, K: Matrix, config: TwoViewConfig) -> TwoViews | Unsolved:
+def two_views(first: Pixels, second: Pixels, K: Matrix, config: TwoViewConfig) -> TwoViews | TwoViewFailure:
     """Returns the motion between two views of the same corners (N, 2), in pixels, or why there is none."""
     if len(first) < config.min_points:
-        return Unsolved.FEW
+        return TwoViewFailure.FEW
     focal = float(K[0, 0])
     if float(np.median(np.linalg.norm(second - first, axis=1))) < config.parallax * focal:
-        return Unsolved.STILL
+        return TwoViewFailure.STILL
     # 1. A rotation alone.
     R = turned(unproject(first, K), unproject(second, K), config.sigma / focal)
     off = np.linalg.norm(project(unproject(first, K) @ R.T, K) - second, axis=1)
     unexplained = float(np.median(off))
     if unexplained < config.parallax * focal:
-        return Unsolved.ROTATION if unexplained < TURNING * config.sigma else Unsolved.FLAT
+        return TwoViewFailure.ROTATION if unexplained < TURNING * config.sigma else TwoViewFailure.FLAT
     # 2. An essential matrix and a homography, by the share of the score that each deserves.
     E = _matrix(cv2.findEssentialMat(first, second, K, cv2.RANSAC, 0.999, config.sigma)[0])
     H = _matrix(cv2.findHomography(first, second, cv2.RANSAC, 2.0 * config.sigma, maxIters=500, confidence=0.999)[0])
     if E is None or H is None:
-        return Unsolved.DISAGREE
+        return TwoViewFailure.DISAGREE
     score_E = _score(_epipolar(E, first, second, K), config.sigma, GATES[1])
     score_H = _score(_transfer(H, first, second), config.sigma, GATES[0])
     planar = score_H > PLANAR * (score_H + score_E)
@@ -88,10 +88,10 @@ def two_views(first: Pixels, second: Pixels, K: Matrix, config: TwoViewConfig) -
     motions = _motions_of_plane(H, K) if planar else _motions(E)
     found = sorted((_judged(T, first, second, K, config) for T in motions), key=lambda f: -f.count)
     if not found or found[0].count < max(config.min_points, SHARP * len(first)):
-        return Unsolved.FLAT if found and found[0].ahead > 0.5 * len(first) else Unsolved.DISAGREE
+        return TwoViewFailure.FLAT if found and found[0].ahead > 0.5 * len(first) else TwoViewFailure.DISAGREE
     best = found[0]
     if len(found) > 1 and found[1].count > CLEAR * best.count:
-        return Unsolved.AMBIGUOUS
+        return TwoViewFailure.AMBIGUOUS
     chosen = np.flatnonzero(best.good)
     return TwoViews(best.T, best.points[chosen], chosen, float(np.median(best.angles[chosen])), planar)
 

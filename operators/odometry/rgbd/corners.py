@@ -71,7 +71,7 @@ def with_new(
 def followed(gray: Gray, keyframe: Keyframe, guess: Pixels, fitter: Fitter) -> Sighting | None:
     """Returns the pose in which most of a keyframe's corners lie where a frame shows them, near guessed pixels (N, 2).
 
-    Smaller images find what has moved far, and lead astray where there is little to tell corners apart: when few agree
+    Smaller images find what has moved far, and lead astray where corners differ little: when few agree
     on a pose, they are looked for again in the whole image alone, within a window around the guess. Bouguet, 2000.
     """
     leveled = with_exposure_of(keyframe.gray, gray)

@@ -50,7 +50,7 @@ class _Plane:
 def unique(
     frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
 ) -> bool:
-    """Returns whether a pose is told from those beside it by shape in every direction, or else by a pattern."""
+    """Returns whether a pose is distinguished from its neighbours by shape in every direction, or else by a pattern."""
     points, normals = _common(frame.surface, T_world_camera, keyframes, slack_of(noise))
     free = free_directions(normals, TELLING)
     if not len(free):

@@ -54,7 +54,7 @@ class StereoKeyframe:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundAgain:
+class RelocalizedPose:
     """A pose of a view in metres, its covariance (6, 6) against the keyframe that it was found by, and its features."""
 
     T_world_camera: Matrix
@@ -84,7 +84,7 @@ class StereoRelocalizer:
 
     def found(
         self, view: StereoKeyframe, chosen: Sequence[StereoKeyframe], known: Sequence[StereoKeyframe], unit: float
-    ) -> Iterator[FoundAgain]:
+    ) -> Iterator[RelocalizedPose]:
         """Yields the poses of a view among chosen keyframes of those known that all that is seen makes sure of.
 
         `unit`: metres. The pose that the view was given does not count.
@@ -98,7 +98,7 @@ class StereoRelocalizer:
         for fit, keyframe in recognised(frame, among, fitter, motion, np.eye(4), there):
             by = next(k for k in known if k.stamp == keyframe.stamp)
             T, covariance = _resized(fit.T_world_camera, unit), scaled_covariance(fit.covariance, unit)
-            yield FoundAgain(T, covariance, fit.inliers, by)
+            yield RelocalizedPose(T, covariance, fit.inliers, by)
 
     def believed(self, view: StereoKeyframe, known: Sequence[StereoKeyframe], unit: float) -> bool:
         """Returns whether shape and brightness in a view and keyframes of its segment confirm its pose."""

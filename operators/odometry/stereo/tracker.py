@@ -22,7 +22,7 @@ from operators.odometry.mono.pose import solved
 from operators.odometry.motion import Motion
 from operators.odometry.stereo.adjustment import Offset, Past, StereoRig, adjust, fitting
 from operators.odometry.stereo.map import StereoMap
-from operators.odometry.stereo.relocalizer import TYPICAL, FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
+from operators.odometry.stereo.relocalizer import TYPICAL, RelocalizedPose, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 
@@ -253,7 +253,7 @@ class StereoOdometry:
             return True
         return self._relocalizer.believed(self._view(pair, T_world_camera, known.segment), known.keyframes, known.unit)
 
-    def _recall(self, pair: StereoPair, T_predicted: Matrix, *, measured: bool) -> FoundAgain | None:
+    def _recall(self, pair: StereoPair, T_predicted: Matrix, *, measured: bool) -> RelocalizedPose | None:
         """Looks for the view in the map: always after a gap, now and then in a new map that is tracked."""
         known = self.state.map
         if pair.flaw is not None or not (self._lost or known.apart_since is not None):
@@ -275,7 +275,7 @@ class StereoOdometry:
                 return found
         return None
 
-    def _supersedes(self, found: FoundAgain, agree: Mask) -> bool:
+    def _supersedes(self, found: RelocalizedPose, agree: Mask) -> bool:
         """Returns whether a pose that was found has more support than the corners that agree on another."""
         elsewhere = found.keyframe.segment != self.state.map.segment
         return elsewhere or found.features > int(np.count_nonzero(agree))
@@ -287,7 +287,7 @@ class StereoOdometry:
         reach = 0.3 + speed * (motion.blind_s + (stamp - motion.stamp) * 1e-9)
         return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)
 
-    def _relocalised(self, pair: StereoPair, T_tracked: Matrix | None, found: FoundAgain) -> TrackResult:
+    def _relocalised(self, pair: StereoPair, T_tracked: Matrix | None, found: RelocalizedPose) -> TrackResult:
         """Takes up a pose that was found among the pairs kept, and a new map that is tracked meanwhile with it."""
         state, T, by = self.state, found.T_world_camera, found.keyframe
         T_known_newest = None if T_tracked is None else T @ invert(T_tracked)

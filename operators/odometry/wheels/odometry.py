@@ -66,7 +66,7 @@ def _each(own: Array | None, given: float | None, name: str, count: int) -> Arra
     if own is not None:
         return own
     if given is None:
-        raise ValueError(f"the message does not tell the wheels' {name}: set the parameter {name}")
+        raise ValueError(f"the message lacks the wheels' {name}: set the parameter {name}")
     return np.full(count, given)
 
 
@@ -81,7 +81,7 @@ class State(Counts):
     drive: DifferentialDrive = field(metadata=KEPT)
     stamp: int | None = None
     last: Reading | None = None
-    speed: Array | None = None  # of left and right, m/s; None until two readings tell it
+    speed: Array | None = None  # of left and right, m/s; None until there are two readings
     step: tuple[Array, float, float] = field(default_factory=lambda: (np.zeros(2), 1.0, 0.0))  # rolled, s, doubt
 
 
@@ -112,8 +112,8 @@ class WheelOdometry(Operator):
     left: tuple[str, ...] = Param(("left",), min_length=1, doc="wheels on the left; the mean of several counts")
     right: tuple[str, ...] = Param(("right",), min_length=1, doc="wheels on the right")
     track: float = Param(gt=0, doc="distance between left and right wheels", unit="m")
-    radius: float | None = Param(None, gt=0, doc="of the wheels, where messages do not tell it", unit="m")
-    ticks_per_turn: float | None = Param(None, gt=0, doc="counts a turn of a wheel, where messages do not tell it")
+    radius: float | None = Param(None, gt=0, doc="of the wheels, where messages lack it", unit="m")
+    ticks_per_turn: float | None = Param(None, gt=0, doc="counts a turn of a wheel, where messages lack it")
     slip: float = Param(
         0.006, ge=0, doc="standard deviation of a wheel's way after 1 m; grows with its root", unit="m/√m"
     )
@@ -178,7 +178,7 @@ class WheelOdometry(Operator):
         return "rolling", Level.OK, f"{float(speed.mean()):.2f} m/s"
 
     def _rolled(self, now: Reading, seconds: float) -> tuple[Array, Array]:
-        """Metres that each side rolled since the last reading, and its speed now as far as it is told."""
+        """Metres that each side rolled since the last reading, and its speed now as far as it is known."""
         if now.rolled is not None and self.state.last is not None and self.state.last.rolled is not None:
             rolled = now.rolled - self.state.last.rolled
             return rolled, rolled / seconds

@@ -24,7 +24,7 @@ def seen_times(nodes: SceneGraph) -> dict[int, int]:
 def mattering(nodes: SceneGraph, labels: LabelSpace, objects: Boxes3D | None = None) -> tuple[list[Body], int]:
     """Returns the nodes that features are made of as upright bodies, and how many of these are not usable.
 
-    `objects` are boxes of the same ids that tell how fast the nodes are; without, all are taken to be still.
+    `objects` are boxes of the same ids, with the speeds of the nodes; without, all are taken to be still.
     """
     names = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
     roles = {name: labels.roles(name) for name in set(names)}

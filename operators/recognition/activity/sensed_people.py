@@ -43,7 +43,7 @@ def sensed_tracks(
     classes: Sequence[str],
     objects: Sequence[Boxes3D | None] = (),
 ) -> list[SensedTrack]:
-    """Returns the agents of a map over time; `doings` and `views` tell what true agents do, and which are in view.
+    """Returns the agents of a map over time; `doings` and `views` give what true agents do, and which are in view.
 
     `objects` are what the recogniser takes besides. If graphs come n times as often as the network takes steps, each
     track is split into n, of every n-th moment.

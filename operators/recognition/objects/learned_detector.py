@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.custom.decode import find_boxes
-from operators.detection.custom.first_look import Looked
+from operators.detection.custom.first_look import FirstStageDetections
 from operators.detection.custom.refiner import Refiner
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms, intersection_over_union
 from operators.network_input import three_channels
 from operators.recognition.objects.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
-from operators.recognition.objects.proposals import F32, Glance, Trunk
+from operators.recognition.objects.proposals import F32, NetworkMaps, Trunk
 from operators.scene.map.file import learned_files, together
 from operators.weights import open_network, shipped, trained_in_simulation
 
@@ -98,7 +98,7 @@ class LearnedDetector(Operator):
         """Counts images, learned objects found, and boxes of known classes that gave way to them."""
         return dict(self._counts)
 
-    def _known(self, glance: Glance, pixels: NDArray[np.uint8]) -> Candidates:
+    def _known(self, glance: NetworkMaps, pixels: NDArray[np.uint8]) -> Candidates:
         """Returns the objects of known classes in an image, in its pixels, as CustomDetector finds them."""
         trunk, refiner = self._trunk, self._refiner
         found = find_boxes(
@@ -113,9 +113,9 @@ class LearnedDetector(Operator):
         found = replace(found, boxes=glance.fit.restore(found.boxes))
         if refiner is None:
             return found
-        return refiner.refined(pixels, Looked(found, glance.more, glance.fit), self.nms_iou)
+        return refiner.refined(pixels, FirstStageDetections(found, glance.more, glance.fit), self.nms_iou)
 
-    def _found(self, glance: Glance) -> Candidates:
+    def _found(self, glance: NetworkMaps) -> Candidates:
         """Returns the learned objects in an image, in its pixels: for each class the surest of boxes that overlap."""
         proposed = self._trunk.propose(glance, LEAST, PROPOSALS)
         described = self._trunk.describe(glance, proposed)
@@ -130,7 +130,7 @@ class LearnedDetector(Operator):
         restored = glance.fit.restore(np.concatenate(boxes))
         return Candidates(restored, np.concatenate(scores), np.concatenate(classes))
 
-    def _drawn(self, glance: Glance, each: LearnedObject, boxes: F32, described: F32) -> tuple[F32, F32]:
+    def _drawn(self, glance: NetworkMaps, each: LearnedObject, boxes: F32, described: F32) -> tuple[F32, F32]:
         """Moves the boxes that may show a learned object to its outline; returns them with their probabilities."""
         rows = np.flatnonzero(each.probability(described) >= _MAYBE)
         boxes, described = boxes[rows], described[rows]

@@ -109,7 +109,7 @@ class LearnedObject:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ImageExamples:
     """Holds what one image gives: vectors of the object (P, D) and of everything else (Q, D); and those of boxes that
     touch the object (R, D), with the changes (R, 4) that would make them its own."""
 
@@ -119,7 +119,7 @@ class Shown:
     changes: F32
 
 
-def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random.Generator) -> Shown:
+def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random.Generator) -> ImageExamples:
     """Returns vectors of an image (H, W, 3) whose objects of the class have boxes (K, 4) in its pixels.
 
     It is looked at as it is, mirrored, from farther and from nearer, so that few images show many sides and sizes.
@@ -142,7 +142,7 @@ def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random
             touching.append(trunk.describe(glance, loose))
             changes.append(_changes(loose, box))
     nothing = np.zeros((0, objects[0].shape[1]), np.float32)
-    return Shown(
+    return ImageExamples(
         np.concatenate(objects),
         np.concatenate(others),
         np.concatenate([nothing, *touching]),
@@ -150,7 +150,7 @@ def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random
     )
 
 
-def learn(name: str, shown: Sequence[Shown], detector: str, inner: tuple[str, ...]) -> LearnedObject:
+def learn(name: str, shown: Sequence[ImageExamples], detector: str, inner: tuple[str, ...]) -> LearnedObject:
     """Learns from images, at least one of which shows the object. Raises LearnedObjectError where none does.
 
     The prototype is the mean vector of the object; directions in which everything varies count less (linear
@@ -178,7 +178,7 @@ def learn(name: str, shown: Sequence[Shown], detector: str, inner: tuple[str, ..
     )
 
 
-def _outline(shown: Sequence[Shown]) -> F32:
+def _outline(shown: Sequence[ImageExamples]) -> F32:
     """Returns (D + 1, 4): the change of a box by its vector, least squares with a penalty on the square of weights."""
     vectors = np.concatenate([each.touching for each in shown]).astype(np.float64)
     changes = np.concatenate([each.changes for each in shown]).astype(np.float64)
@@ -190,7 +190,7 @@ def _outline(shown: Sequence[Shown]) -> F32:
     return np.concatenate([weights, (usual - mean @ weights)[None]]).astype(np.float32)
 
 
-def _discriminant(shown: Sequence[Shown]) -> tuple[F32, F32]:
+def _discriminant(shown: Sequence[ImageExamples]) -> tuple[F32, F32]:
     """Returns the mean of everything else and the direction, scaled so that the prototype's resemblance is 1."""
     objects = np.concatenate([each.object for each in shown]).astype(np.float64)
     others = np.concatenate([each.others for each in shown]).astype(np.float64)

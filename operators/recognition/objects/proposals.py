@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from operators.detection.custom.decode import decode_grid
 from operators.detection.nms import class_wise_nms
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.inference import open_session
 from operators.weights import NetworkFileError, open_network
 
@@ -28,13 +28,13 @@ _HUES, _GREYS, _CELL = 8, 4, 4  # colours, and shades without one; pixels along 
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
+class NetworkMaps:
     """An image as the network sees it: the grid's raw maps, the inner maps (C, H, W), how it was fitted in, and the
     maps (1, C, H, W) that a refiner asks for."""
 
     maps: Sequence[F32]
     trunk: Sequence[F32]
-    fit: Fit
+    fit: ImageFit
     more: Sequence[F32] = ()
 
 
@@ -57,9 +57,9 @@ class Trunk:
             file, reveal=[*(name for name in self.inner if name != COLOR), *more]
         )
 
-    def look(self, pixels: NDArray[np.uint8]) -> Glance:
+    def look(self, pixels: NDArray[np.uint8]) -> NetworkMaps:
         """Runs the network on an image (H, W, 3), RGB."""
-        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
+        fit = ImageFit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
         fitted = fit.apply(pixels)
         tensor = np.ascontiguousarray(fitted.transpose(2, 0, 1)[None], np.float32)
         tensor /= np.float32(255)
@@ -68,16 +68,16 @@ class Trunk:
         shown = [name for name in self.inner if name != COLOR]
         maps = dict(zip(shown, found[known : known + len(shown)], strict=True))
         inner = [color_map(fitted) if name == COLOR else maps[name][0] for name in self.inner]
-        return Glance(found[:known], inner, fit, found[known + len(shown) :])
+        return NetworkMaps(found[:known], inner, fit, found[known + len(shown) :])
 
-    def propose(self, glance: Glance, threshold: float, most: int) -> F32:
+    def propose(self, glance: NetworkMaps, threshold: float, most: int) -> F32:
         """Returns boxes (N, 4) in the network's pixels around anything, whatever its class, by falling score."""
         found = decode_grid(glance.maps, self.anchors, self.strides, len(self.classes), threshold)
         found = found.select(np.argsort(-found.scores, kind="stable")[: 20 * most])
         kept = class_wise_nms(found.boxes, found.scores, np.zeros_like(found.classes), 0.7)[:most]
         return found.boxes[kept]
 
-    def describe(self, glance: Glance, boxes: F32) -> F32:
+    def describe(self, glance: NetworkMaps, boxes: F32) -> F32:
         """Returns (N, D): each inner map averaged over the four quarters of each box (N, 4), of length 1 a map."""
         parts = [_pooled(each, boxes, self.size) for each in glance.trunk]
         return np.concatenate(

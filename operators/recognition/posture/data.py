@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 POSTURES = ("standing", "walking", "sitting_down", "sitting", "standing_up", "reaching", "drinking")
 """Activities of persons for which a single look is evidence."""
 BODY = 18
-"""Values that tell a posture: five joints (right, away, up), where the chest points (away, right), the lean."""
+"""Values that show a posture: five joints (right, away, up), where the chest points (away, right), the lean."""
 
 
 @dataclass(frozen=True, eq=False)

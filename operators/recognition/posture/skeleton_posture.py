@@ -30,7 +30,9 @@ class SkeletonPosture(Operator):
     keypoints: In[Keypoints2D] = In(
         doc="joints of people with COCO's names; SceneGraphBuilder wants the ids of their nodes"
     )
-    postures: Out[Classification] = Out(doc="standing or sitting, with probabilities, of each person whose joints tell")
+    postures: Out[Classification] = Out(
+        doc="standing or sitting, with probabilities, of each person whose joints show it"
+    )
 
     least: float = Param(0.5, ge=0, le=1, tunable=True, doc="score from which a joint counts")
 

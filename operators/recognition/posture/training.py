@@ -29,7 +29,7 @@ _BATCH = 256
 class PostureNetwork(nn.Module):
     """Silhouettes (N, 3, SIDE, SIDE) → scores (N, C) of activities, and where the limbs are (N, BODY).
 
-    Limbs are learned beside the activities, since they tell much more of each silhouette than one name does; in use
+    Limbs are learned beside the activities, since they show much more of each silhouette than one name does; in use
     they are left out. Residual blocks: He et al., "Deep residual learning for image recognition", 2016.
     """
 

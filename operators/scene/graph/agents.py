@@ -30,7 +30,7 @@ ACTIVITIES = (
     "resting",
     UNKNOWN,
 )
-_WINDOW = 1.0  # seconds of the past that tell how an agent moves
+_WINDOW = 1.0  # seconds of the past that show how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
 _KNOWN = 0.6  # probability from which an agent is said to move, or not
 _RISING = 0.15  # m/s, of the head

@@ -46,7 +46,7 @@ class LiftSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ProjectedCloud:
     """A cloud as the camera sees it: points (N, 3), their pixels (N, 2), which are in the image, and up (3,).
 
     `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks. `grain` is the number
@@ -85,7 +85,7 @@ class _Columns:
     starts: Sequence[int]
 
     @classmethod
-    def of(cls, seen: Seen) -> _Columns:
+    def of(cls, seen: ProjectedCloud) -> _Columns:
         inside = np.flatnonzero(seen.inside)
         columns = seen.places[0, inside].astype(np.uint16)  # so few bits are sorted in a tenth of the time of floats
         starts = np.cumsum(np.bincount(columns)).tolist()
@@ -139,7 +139,7 @@ class _Grown:
 
 
 def lift(
-    seen: Seen,
+    seen: ProjectedCloud,
     boxes: Array,
     mask_classes: Sequence[int],
     background: Sequence[int],
@@ -199,7 +199,7 @@ def lift(
     return sorted(kept, key=lambda c: c.detection)
 
 
-def _on(mask: Mask, seen: Seen, rows: Indices) -> Indices:
+def _on(mask: Mask, seen: ProjectedCloud, rows: Indices) -> Indices:
     """Returns those of some points that are on an object's mask (H, W)."""
     columns, lines = seen.places[:2].take(rows, axis=1).astype(np.intp)
     return np.asarray(rows[mask[lines, columns]])
@@ -221,7 +221,12 @@ def _of_class(
 
 
 def _body(
-    seen: Seen, columns: Array, lines: Array, own: Mask, box: tuple[float, float, float, float], s: LiftSettings
+    seen: ProjectedCloud,
+    columns: Array,
+    lines: Array,
+    own: Mask,
+    box: tuple[float, float, float, float],
+    s: LiftSettings,
 ) -> tuple[Indices, float] | None:
     """Returns the points of the body that a box is around, and the share of its mask in the box that they are.
 
@@ -274,7 +279,7 @@ def _divided(
     return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]
 
 
-def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
+def _off_support(seen: ProjectedCloud, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
     """Returns the points that are not on a level surface which goes on in the ring around the box."""
     if not len(rows) or len(ring) < s.min_points:
         return rows
@@ -290,7 +295,7 @@ def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> I
 
 
 def _object(
-    seen: Seen, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
+    seen: ProjectedCloud, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
 ) -> tuple[Indices, float] | None:
     """Returns the points of the object in a box and the overlap of their image with it."""
     if len(rows) < s.min_points:
@@ -314,7 +319,12 @@ def _object(
 
 
 def _best(
-    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings, *, masked: bool
+    seen: ProjectedCloud,
+    parts: Sequence[_Part],
+    box: tuple[float, float, float, float],
+    s: LiftSettings,
+    *,
+    masked: bool,
 ) -> tuple[_Part, float]:
     """Returns the part, grown by others near it, that is the object of a box, and the overlap of its image with it.
 
@@ -334,7 +344,7 @@ def _best(
 
 
 def _grown(
-    seen: Seen, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings
+    seen: ProjectedCloud, parts: Sequence[_Part], box: tuple[float, float, float, float], s: LiftSettings
 ) -> Iterator[_Grown]:
     """Gives each part together with those near it that make it fill the box better, which are not begun with then.
 
@@ -372,7 +382,7 @@ def _median(values: Array) -> float:
     return float(ranked[middle] if len(values) % 2 else (ranked[middle - 1] + ranked[middle]) / 2)
 
 
-def _central(seen: Seen, rows: Indices, box: tuple[float, float, float, float]) -> int:
+def _central(seen: ProjectedCloud, rows: Indices, box: tuple[float, float, float, float]) -> int:
     """Counts the points in the inner half of a box: of a thing; what shows around it has few."""
     u, v = seen.places[:2].take(rows, axis=1)
     wide = np.abs(u - (box[0] + box[2]) / 2) <= (box[2] - box[0]) / 4
@@ -411,13 +421,13 @@ def _groups(linked: Sequence[int]) -> NDArray[np.intp]:
     return group
 
 
-def _part(seen: Seen, rows: Indices) -> _Part:
+def _part(seen: ProjectedCloud, rows: Indices) -> _Part:
     own = seen.places.take(rows, axis=1)
     bounds = np.stack([own[2:].min(axis=1), own[2:].max(axis=1)])
     return _Part(rows, _image(seen, own[0], own[1]), bounds)
 
 
-def _image(seen: Seen, u: Array, v: Array) -> tuple[float, float, float, float]:
+def _image(seen: ProjectedCloud, u: Array, v: Array) -> tuple[float, float, float, float]:
     """Returns the box around pixels, columns `u` (N,) and lines `v`, of which one in a hundred may stray."""
     cut, g = len(u) // 100, seen.grain
     if not cut:

@@ -29,7 +29,7 @@ from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.labels import LabelSpace, labels_file
-from operators.scene.lifting.frustums import Lifted, LiftSettings, Seen, lift
+from operators.scene.lifting.frustums import Lifted, LiftSettings, ProjectedCloud, lift
 from operators.status import counted_status
 
 _MOST_GRAIN = 4.0  # pixels
@@ -179,7 +179,7 @@ def _check(detections: Detections2D, info: CameraInfo) -> None:
 
 def _seen(
     points: NDArray[np.float64], T_image_cloud: Any, info: CameraInfo, masks: SegmentationMap | None, up: Any
-) -> Seen:
+) -> ProjectedCloud:
     in_image = transform_points(T_image_cloud, points)
     pixels = project(in_image, info.K)
     u, v = np.ascontiguousarray(pixels.T)
@@ -191,7 +191,7 @@ def _seen(
         classes[inside] = masks.classes[row, column]
     spacing = np.sqrt(info.width * info.height / max(int(inside.sum()), 1))
     grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
-    return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
+    return ProjectedCloud(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
 
 
 def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], found: list[Lifted]) -> Boxes3D:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 MOST_EVIDENCE = 6.0
 WHOLE = 100_000_000
-"""Nanoseconds since the last view of a thing, from which a view counts in full: sooner ones tell the same again."""
+"""Nanoseconds since the last view of a thing, from which a view counts in full: sooner ones show the same again."""
 
 _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 16  # views of an object
@@ -29,7 +29,7 @@ _FAR, _ENOUGH = 1.6, 5  # a view is dropped at so many times the range of the th
 _SAMPLE = 16  # points of a view that are kept
 _SMALL = 0.5  # metres up to which things are seen whole, so that the kept views have points enough
 _STRAYS = 2.5  # standard deviations by which the edges of a view stray that is of something else
-_APART = 0.02  # angle, rad, and a third of the change of the distance, from which two views tell different things
+_APART = 0.02  # angle, rad, and a third of the change of the distance, from which two views show different things
 _AGAIN = 0.25  # share of the views that are new, from which the box is fitted again
 _SETTLED = 9  # views after which the way in which it stands is settled
 _POINTS = 45  # points of an object that a fit uses

@@ -85,7 +85,7 @@ def alike(
     """Returns how likely an observation is of an object: in [0, 1], more if it is of its track, 0 where it is not.
 
     `image` has the IoU of its image with that of the object's box, and the share of the first that is in the second,
-    where there is an image. `large` things are seldom seen whole: their voxels tell.
+    where there is an image. `large` things are seldom seen whole: their voxels decide.
     """
     iou, within = (math.nan, math.nan) if image is None else image
     away = outside(voxels.middle, object.box)

@@ -97,7 +97,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Holds what a person wears, as patches that are added to the parts of the body: trunk, hips and head."""
 
     skin: Material
@@ -122,7 +122,7 @@ def drawn_body(rng: Rng) -> Body:
     trousers = Material("fabric", tone(rng, (0, 1), (0.1, 0.6), (0.14, 0.6)), tile=0.3)
     shoes = Material("plain", dark(rng), tile=0.3)
     sleeve = shirt if rng.uniform() < 0.6 else skin
-    return _dressed(h, build, Look(skin, hair, shirt, trousers, shoes, sleeve, trousers))
+    return _dressed(h, build, Appearance(skin, hair, shirt, trousers, shoes, sleeve, trousers))
 
 
 def varied_body(rng: Rng) -> Body:
@@ -153,10 +153,10 @@ def varied_body(rng: Rng) -> Body:
     elif worn < 0.6:  # long hair, down to the shoulders
         head = at(ellipsoid(0.03 * h, 0.052 * h, 0.085 * h, hair, segments=12, rings=8), x=-0.045 * h, z=-0.015 * h)
     shin = skin if bare else trousers
-    return _dressed(h, build, Look(skin, hair, shirt, trousers, shoes, sleeve, shin, hips, trunk, head))
+    return _dressed(h, build, Appearance(skin, hair, shirt, trousers, shoes, sleeve, shin, hips, trunk, head))
 
 
-def _dressed(h: float, build: float, look: Look) -> Body:
+def _dressed(h: float, build: float, look: Appearance) -> Body:
     """A body of a height (m) and build with a look."""
     skin, hair, shirt, trousers = look.skin, look.hair, look.shirt, look.trousers
     face = Material("face", skin.tint, tile=0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from operators.simulator.people.body import drawn_body
-from operators.simulator.people.movers import Carried, Driving, Rolling
+from operators.simulator.people.movers import CarriedObject, Driving, Rolling
 from operators.simulator.people.persons import Person
 from operators.simulator.people.scripts import Point, Polyline, Timeline, coffee_break, errand, pacing
 from operators.simulator.scene import ROVER, WALKER, Builder
@@ -87,7 +87,7 @@ def carry(builder: Builder, person: Person, id: int, shape: Shape, label: str, T
     acts, timeline = person.timeline.acts, person.timeline
     first = next(k for k, act in enumerate(acts) if act.object == id and act.activity == "reaching")
     reached = sum(act.seconds for act in acts[: first + 1])
-    builder.move(label, (shape,), Carried(id, T, person, reached - 1e-6 - timeline.phase), id=id)
+    builder.move(label, (shape,), CarriedObject(id, T, person, reached - 1e-6 - timeline.phase), id=id)
     builder.relate(id, "on", on, lambda t: person.held(t) != id)
 
 

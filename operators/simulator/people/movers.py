@@ -12,7 +12,7 @@ import numpy as np
 
 from operators.simulator.people.persons import Person
 from operators.simulator.people.scripts import Act, Timeline, mix
-from operators.simulator.scene import Doing
+from operators.simulator.scene import CurrentActivity
 from operators.simulator.shapes import Array, pose
 from operators.simulator.trajectory import Trajectory
 
@@ -51,9 +51,9 @@ class Rolling:
         T[:3, :3] = np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
         return T[None]
 
-    def doing(self, thing: int, t: float) -> Doing:
+    def doing(self, thing: int, t: float) -> CurrentActivity:
         act, _, began = self.timeline.at(t)
-        return Doing(thing, act.activity, began, act.goal)
+        return CurrentActivity(thing, act.activity, began, act.goal)
 
     def _run(self, t: float) -> float:
         act, x, _ = self.timeline.at(t)
@@ -80,15 +80,15 @@ class Driving:
     def parts(self, t: float) -> Array:
         return self.frame(t)[None]
 
-    def doing(self, thing: int, t: float) -> Doing:
+    def doing(self, thing: int, t: float) -> CurrentActivity:
         if not self._turns:
-            return Doing(thing, "driving", 0.0, "drive a loop")
+            return CurrentActivity(thing, "driving", 0.0, "drive a loop")
         u = (t + self._phase) % self._path.period
         begin, activity = self._turns[bisect_right(self._turns, (u, "~")) - 1]
-        return Doing(thing, activity, t - (u - begin) % self._path.period, "drive a loop")
+        return CurrentActivity(thing, activity, t - (u - begin) % self._path.period, "drive a loop")
 
 
-class Carried:
+class CarriedObject:
     """A thing that lies still except while a person's hand has it: then it moves with the hand, upright."""
 
     def __init__(self, thing: int, T_rest: Array, person: Person, grasped_at: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from operators.simulator.people.body import Body, Posture
 from operators.simulator.people.scripts import Point, Polyline, Timeline, mix
-from operators.simulator.scene import Doing
+from operators.simulator.scene import CurrentActivity
 from operators.simulator.shapes import Array, pose
 from operators.simulator.trajectory import wrapped
 
@@ -33,9 +33,9 @@ class Person:
             self._parts = (t, self.body.poses(self.posture(t)))
         return self._parts[1]
 
-    def doing(self, thing: int, t: float) -> Doing:
+    def doing(self, thing: int, t: float) -> CurrentActivity:
         act, _, began = self.timeline.at(t)
-        return Doing(thing, act.activity, began, act.goal, act.object)
+        return CurrentActivity(thing, act.activity, began, act.goal, act.object)
 
     def held(self, t: float) -> int:
         """The object that the hand has, -1 for none."""

@@ -15,7 +15,7 @@ from operators.simulator.shapes import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Baked:
+class BakedLight:
     """Light on still vertices (V,) by where it comes from; `shades` are those of lamps, which shine as lamps do."""
 
     world: World
@@ -28,7 +28,7 @@ class Baked:
     @classmethod
     def of(
         cls, world: World, mesh: Mesh, lamps: list[int], occluded: Callable[[F32, float], NDArray[np.bool_]]
-    ) -> Baked:
+    ) -> BakedLight:
         """`lamps` are the indices of things whose glow is that of a lamp."""
         lamps_light, sun, ambient = _bake(world, mesh.vertices, mesh.normals, occluded)
         return cls(world, lamps_light, sun, ambient, mesh.glow, np.isin(mesh.thing_of_vertex, lamps))

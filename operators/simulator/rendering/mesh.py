@@ -63,7 +63,7 @@ class Mesh:
         self.density = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)  # texels per metre
 
 
-class Apart:
+class SeparatedScene:
     """The same things, each in a separate place, far from all others: what each alone would look like."""
 
     def __init__(self, still: Mesh, moving: Mesh, build: Callable[[Array, NDArray[np.int64]], Scene]) -> None:

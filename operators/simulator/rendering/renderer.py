@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
 from operators.simulator.classes import CLASS_IDS, VOID
-from operators.simulator.rendering.lighting import Baked, Floor, dimmed, direct
-from operators.simulator.rendering.mesh import APART, Apart, Mesh, Scene, placed, shift
+from operators.simulator.rendering.lighting import BakedLight, Floor, dimmed, direct
+from operators.simulator.rendering.mesh import APART, Mesh, Scene, SeparatedScene, placed, shift
 from operators.simulator.rendering.native import open3d
 from operators.simulator.rendering.optics import F32, I32, Optics, View, camera_rays, inverse_lengths, rectangle
 from operators.simulator.scene import World
@@ -79,7 +79,7 @@ class Renderer:
         self._mover_vertices = [np.flatnonzero(self._moving.thing_of_vertex == k) for k in self._movers]
 
         lamps = [k for k, thing in enumerate(things) if thing.label == "lamp"]
-        self._baked = Baked.of(world, self._mesh, lamps, self._occluded)
+        self._baked = BakedLight.of(world, self._mesh, lamps, self._occluded)
         both = (self._mesh, self._moving)
         self._thing_of_triangle = np.concatenate([m.thing_of_triangle for m in both])
         self._id_of_thing = np.array([*(thing.id for thing in things), 0], np.uint16)
@@ -95,7 +95,7 @@ class Renderer:
         self._floor = Floor(self._mesh, [k for k, thing in enumerate(things) if thing.label == "floor"])
         self._lit: float | None = None
         self._time: float | None = None
-        self._apart: Apart | None = None
+        self._apart: SeparatedScene | None = None
         self._corners: dict[int, Array] = {}
         self.at(0.0)
 
@@ -171,7 +171,7 @@ class Renderer:
         border of one image size on each side.
         """
         if self._apart is None:
-            self._apart = Apart(self._mesh, self._moving, self._build)
+            self._apart = SeparatedScene(self._mesh, self._moving, self._build)
         counts = np.zeros(len(things))
         still: list[tuple[int, F32, int]] = []
         moving: list[tuple[int, F32, int]] = []

@@ -8,7 +8,7 @@ import numpy as np
 
 from operators.simulator.people.choosers import add_chooser
 from operators.simulator.people.inhabitants import add_ball, add_rover, add_walker
-from operators.simulator.scene import Builder, Light, Order, World
+from operators.simulator.scene import Builder, Light, World, WorldOptions
 from operators.simulator.shapes import Array
 from operators.simulator.things import furniture
 from operators.simulator.things.furnishing import (
@@ -27,7 +27,7 @@ LANE = 1.0
 """Metres between the block and the robot's path; those who come towards it keep to the outer wall."""
 
 
-def corridor(seed: int, order: Order) -> World:
+def corridor(seed: int, order: WorldOptions) -> World:
     """A ring of about thirty metres, drawn from the seed."""
     rng = np.random.default_rng([seed, 2])
     block_x, block_y, width = rng.uniform(3.0, 4.2), rng.uniform(2.0, 3.0), rng.uniform(2.75, 3.0)

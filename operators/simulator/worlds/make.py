@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from operators.simulator.scene import Order, World
+from operators.simulator.scene import World, WorldOptions
 from operators.simulator.worlds.corridor import corridor
 from operators.simulator.worlds.office import office
 from operators.simulator.worlds.table_top import table_top
 from operators.simulator.worlds.yard import yard
 
-_MAKERS: dict[str, Callable[[int, Order], World]] = {
+_MAKERS: dict[str, Callable[[int, WorldOptions], World]] = {
     "office": office,
     "corridor": corridor,
     "table_top": table_top,
@@ -35,4 +35,4 @@ def make_world(
     maker = _MAKERS.get(name)
     if maker is None:
         raise ValueError(f"no world {name!r}; there are {', '.join(NAMES)}")
-    return maker(seed, Order(speed, hold, movers, people, tour, jumps))
+    return maker(seed, WorldOptions(speed, hold, movers, people, tour, jumps))

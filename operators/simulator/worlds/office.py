@@ -8,7 +8,7 @@ import numpy as np
 
 from operators.simulator.people.choosers import add_chooser
 from operators.simulator.people.inhabitants import add_ball, add_desk_worker, add_rover, add_walker
-from operators.simulator.scene import WALKER, Builder, Light, Order, World
+from operators.simulator.scene import WALKER, Builder, Light, World, WorldOptions
 from operators.simulator.shapes import Array, pose
 from operators.simulator.things import furniture
 from operators.simulator.things.furnishing import (
@@ -32,7 +32,7 @@ OUT = 1.8
 """Metres between a wall and the middle of its lane."""
 
 
-def office(seed: int, order: Order) -> World:
+def office(seed: int, order: WorldOptions) -> World:
     """A world of about nine by eight metres, drawn from the seed."""
     rng = np.random.default_rng([seed, 1])
     half_x, half_y, height = rng.uniform(4.3, 5.0), rng.uniform(3.7, 4.2), rng.uniform(2.5, 2.9)

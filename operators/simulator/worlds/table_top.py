@@ -8,7 +8,7 @@ import numpy as np
 
 from operators.simulator.people.choosers import add_chooser
 from operators.simulator.people.inhabitants import add_ball, add_drinker, add_walker, arm_room
-from operators.simulator.scene import Builder, Light, Order, World
+from operators.simulator.scene import Builder, Light, World, WorldOptions
 from operators.simulator.shapes import Array, pose
 from operators.simulator.things import furniture, objects
 from operators.simulator.things.furnishing import (
@@ -25,7 +25,7 @@ from operators.simulator.things.furnishing import (
 )
 
 
-def table_top(seed: int, order: Order) -> World:
+def table_top(seed: int, order: WorldOptions) -> World:
     """A room of about seven metres with one table, drawn from the seed."""
     rng = np.random.default_rng([seed, 3])
     half_x, half_y, height = rng.uniform(3.4, 3.8), rng.uniform(3.4, 3.8), rng.uniform(2.4, 2.7)

@@ -8,7 +8,7 @@ import numpy as np
 
 from operators.simulator.people.choosers import add_chooser
 from operators.simulator.people.inhabitants import add_ball, add_rover, add_walker
-from operators.simulator.scene import Builder, Light, Order, World
+from operators.simulator.scene import Builder, Light, World, WorldOptions
 from operators.simulator.shapes import Array, Material, box, pose, sheet
 from operators.simulator.things import furniture
 from operators.simulator.things.furnishing import (
@@ -38,7 +38,7 @@ FENCE = 1.4
 """Height of the wall around the yard, metres."""
 
 
-def yard(seed: int, order: Order) -> World:
+def yard(seed: int, order: WorldOptions) -> World:
     """A hall of nine by ten metres and a yard of about twelve by thirteen, drawn from the seed."""
     rng = np.random.default_rng([seed, 4])
     length, half, height = rng.uniform(11.5, 13.0), rng.uniform(6.4, 7.0), rng.uniform(3.1, 3.5)

@@ -34,7 +34,7 @@ _PRIOR_AREA = 10.0
 
 @dataclass(frozen=True)
 class Association:
-    """Rules by which sightings without identity are told apart.
+    """Rules by which sightings without identity are associated.
 
     A sighting belongs to a landmark within `gate` (probability that a true pair passes); it is a new landmark beyond
     `new` of all; between the two it is ambiguous and ignored.

@@ -1,6 +1,6 @@
 """Consistency of landmark SLAM: innovations against their covariance, and landmarks against their expected places.
 
-From the innovations follows how much noisier the odometry is than it was told to be (covariance matching: Mehra, "On
+From the innovations follows how much noisier the odometry is than it was set to be (covariance matching: Mehra, "On
 the identification of variances and adaptive Kalman filtering", 1970). Where landmarks are not seen at their places, and
 others are in between, the robot is lost.
 """
@@ -14,10 +14,10 @@ _KEPT = 0.995
 """Share of the sums that remains at each message: they are of about 200 messages."""
 _SIGNIFICANT = 3.0
 _KNOWN = 3.0
-"""Standard deviation, over what was told, up to which the odometry's variance as innovations show it counts: where
+"""Standard deviation, over the given one, up to which the odometry's variance as innovations show it counts: where
 sightings outweigh the motion, chance decides it."""
 _MOST = 100.0
-"""Variance of the odometry over what was told, at most."""
+"""Variance of the odometry over the given one, at most."""
 _FEW, _LOST = 2, 3
 """Landmarks not at their places, where fewer are, and messages of such by which a robot is lost."""
 
@@ -32,7 +32,7 @@ class Consistency:
     motion: float = 0.0
     """Part of the freedom that the odometry's noise since the sighting before makes up."""
     variance: float = 0.0
-    """Sum of the odometry's variance as innovations show it, over what was told, weighted by `motion`."""
+    """Sum of the odometry's variance as innovations show it, over the given one, weighted by `motion`."""
     spread: float = 0.0
     """Variance of `variance` by chance."""
     strayed: int = 0
@@ -40,7 +40,7 @@ class Consistency:
 
     @property
     def odometry_variance(self) -> float:
-        """Variance of the odometry over what was told; 1 unless it is larger beyond chance."""
+        """Variance of the odometry over the given one; 1 unless it is larger beyond chance."""
         known = self.freedom > 0 and math.sqrt(2 * self.freedom) <= _KNOWN * self.motion
         if not known or self.variance - _SIGNIFICANT * math.sqrt(self.spread) <= self.motion:
             return 1.0

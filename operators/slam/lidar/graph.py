@@ -16,7 +16,7 @@ from operators.slam.keyframe_graph import SAVED, KeyframeGraph, Node
 from operators.slam.lidar.scan_context import likeness
 from operators.slam.lidar.view import LidarEyes, LidarSight, LidarView
 from operators.slam.place_graph import PlaceGraph
-from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting, alike
+from operators.slam.sensor_model import Eyes, KeyframeResult, PlaceSettings, Sighting, alike
 
 DRIFT = np.diag([0.004**2] * 3 + [0.0015**2] * 3)  # errors of odometry beyond its covariance, over a metre
 STEP = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # and at each keyframe
@@ -93,7 +93,7 @@ class LidarGraph(PlaceGraph[LidarView]):
 
     def add(
         self, stamp: int, T_odom: Matrix, covariance: Matrix, view: LidarView, segment: int, found_again: bool
-    ) -> Added:
+    ) -> KeyframeResult:
         """Takes a scan and its pose in the odometry frame.
 
         `segment` is the number of the odometry's map; `found_again`: it found this map again after a loss.
@@ -119,14 +119,14 @@ class LidarGraph(PlaceGraph[LidarView]):
         return covariance_odom if began_here and np.trace(covariance_odom) < np.trace(covariance) else covariance
 
     def _recognised(
-        self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: Added
+        self, number: int, candidates: Sequence[int], eyes: Eyes[LidarView], added: KeyframeResult
     ) -> list[tuple[int, Sighting]]:
         """Begins to look for a scan in views that look alike, unless another is looked for: see `_continue`."""
         if self.search is None and self.again is None and candidates:
             self.search = Search(number, list(candidates))
         return []
 
-    def _continue(self, added: Added) -> None:
+    def _continue(self, added: KeyframeResult) -> None:
         """Goes on with the search, by a bounded number of views: each look takes a good part of a second.
 
         Rivals of a place are looked at while the sensor is on its way to the scan that confirms it.
@@ -143,7 +143,7 @@ class LidarGraph(PlaceGraph[LidarView]):
             if self.again is not None and self.place is not None and not self.place.rivals:
                 self._take(self.again, added)
 
-    def _compare(self, search: Search, added: Added) -> None:
+    def _compare(self, search: Search, added: KeyframeResult) -> None:
         """Compares a scan with one more view; after the last, decides whether they give a place."""
         seen = self._sights(search.number, [search.candidates.pop(0)], self._eyes, False, added)
         search.sights += [(k, sight) for k, sight in seen if isinstance(sight, LidarSight)]
@@ -170,7 +170,7 @@ class LidarGraph(PlaceGraph[LidarView]):
         way = invert(self.nodes[self.place.number].T_odom) @ self.nodes[search.number].T_odom
         return alike(self.nodes[known].T @ best.T_known_seen @ way, self.nodes[other].T @ seen.T_known_seen)
 
-    def _take(self, search: Search, added: Added) -> None:
+    def _take(self, search: Search, added: KeyframeResult) -> None:
         """Closes the loop to the view that looks most alike: all that are believed say the same, and none elsewhere."""
         self.search = self.place = self.again = None
         loops = search.sights[:1]

@@ -12,8 +12,8 @@ from operators.odometry.lidar.tracker import Tracked
 from operators.odometry.tracking import Status
 from operators.slam.lidar.graph import LidarGraph
 from operators.slam.lidar.view import LidarView
-from operators.slam.place import Mapped, mapped
-from operators.slam.sensor_model import Added
+from operators.slam.place import MappingResult, mapped
+from operators.slam.sensor_model import KeyframeResult
 
 
 class LidarMapper(Remembered):
@@ -28,13 +28,13 @@ class LidarMapper(Remembered):
         self.graph, self._view = graph, view
         self._segment, self._lost, self._jumped = 0, False, False
 
-    def take(self, tracked: Tracked, stamp: int) -> Mapped:
+    def take(self, tracked: Tracked, stamp: int) -> MappingResult:
         """Takes what the odometry made of the next scan."""
         if self._lost and tracked.state is Status.TRACKING:
             self._segment += 1  # it is lost until it finds its map again, or begins a new one
         self._lost = tracked.state is Status.LOST
         self._jumped |= tracked.state is Status.RELOCALISED
-        added = Added()
+        added = KeyframeResult()
         if tracked.points is not None:
             view = self._view(tracked.points.astype(np.float32))
             added = self.graph.add(stamp, tracked.T, tracked.covariance, view, self._segment, self._jumped)

@@ -15,11 +15,11 @@ from operators.odometry.rgbd.keyframe import Keyframe
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
 from operators.slam.place_graph import WINDOW, PlaceGraph
-from operators.slam.sensor_model import Added, Eyes, PlaceSettings, Sighting
+from operators.slam.sensor_model import Eyes, KeyframeResult, PlaceSettings, Sighting
 from operators.slam.visual.bundle import adjust_newest
 from operators.slam.visual.map_points import MapPoints
 from operators.slam.visual.place_index import PlaceIndex
-from operators.slam.visual.view import Judge, Sight, View, sight
+from operators.slam.visual.view import Judge, View, ViewMatch, sight
 
 DRIFT = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # what odometry may be off besides: it errs more where things move
 LEAST = np.diag([0.0005**2] * 3 + [0.0003**2] * 3)  # of a sight: calibration errs alike in all
@@ -54,7 +54,7 @@ class CameraEyes:
     def distance(self, T_a: Matrix, T_b: Matrix) -> float:
         return view_distance(T_a, T_b, self.depth)
 
-    def sight(self, nodes: Mapping[int, Node[View]], known: int, seen: int, expected: bool) -> Sight | str:
+    def sight(self, nodes: Mapping[int, Node[View]], known: int, seen: int, expected: bool) -> ViewMatch | str:
         """Features place a view; where they are too few, it is looked for where the map expects it."""
         one, other = nodes[known].view, nodes[seen].view
         assert one is not None
@@ -90,7 +90,7 @@ class VisualGraph(PlaceGraph[View]):
         self._judge = settings.judge
         self.points = MapPoints()
 
-    def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
+    def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> KeyframeResult:
         """Takes a keyframe of the odometry, and what fits its poses.
 
         `found_again`: the odometry has found its own map again, so that its pose jumped.
@@ -121,7 +121,7 @@ class VisualGraph(PlaceGraph[View]):
 
     def _confirmed(self, k: int, number: int, seen: Sighting) -> bool:
         """Leaves out surprises that rest on one plane, since two views of a repeated pattern say the same."""
-        if isinstance(seen, Sight) and seen.relief < self._judge.relief:
+        if isinstance(seen, ViewMatch) and seen.relief < self._judge.relief:
             return False
         return super()._confirmed(k, number, seen)
 

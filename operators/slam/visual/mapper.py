@@ -14,13 +14,13 @@ from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import scaled_intrinsics
 from operators.odometry.rgbd.tracker import RgbdOdometry, RgbdState
 from operators.odometry.tracking import Status, TrackResult
-from operators.slam.place import Mapped, mapped
-from operators.slam.sensor_model import Added
+from operators.slam.place import MappingResult, mapped
+from operators.slam.sensor_model import KeyframeResult
 from operators.slam.visual.graph import GraphSettings, VisualGraph
 
 
 @dataclass(frozen=True, eq=False)
-class SlamResult(Mapped):
+class SlamResult(MappingResult):
     """Holds what a frame gave to the map, and what the odometry made of it."""
 
     odometry: TrackResult
@@ -57,7 +57,7 @@ class RgbdSlam:
         self.state.jumped |= result.status is Status.RELOCALISED
         if result.taken_back is not None:
             self.graph.withdraw(result.taken_back)
-        added = Added()
+        added = KeyframeResult()
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)
             working = replace(self.camera, K_color=scaled_intrinsics(self.camera.K_color, 1.0 / factor))

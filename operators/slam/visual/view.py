@@ -28,7 +28,7 @@ from operators.slam.visual.place_index import rooted
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
-# Working pixels. Tracks that miss by more tell of colour and depth that are not of one place and time, and then every
+# Working pixels. Tracks that miss by more show colour and depth that are not of one place and time, and then every
 # sight errs anew: its variance grows with the fourth power of it.
 ASTRAY = 0.45
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
@@ -84,7 +84,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ViewMatch:
     """Holds how a camera's view was measured against a known one, and what supports it.
 
     `inliers` features agree with the pose, of which `relief` lie off the plane that holds most of them; `overlap` is
@@ -114,7 +114,7 @@ class Judge:
     agreement: float = 0.8
     relief: int = 8
 
-    def doubt(self, sight: Sight) -> str:
+    def doubt(self, sight: ViewMatch) -> str:
         """Returns why a sight is not to be believed; nothing for one that is."""
         if sight.inliers < self.inliers:
             return "too few features agree"
@@ -125,7 +125,7 @@ class Judge:
         return ""
 
 
-def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> Sight | None:
+def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> ViewMatch | None:
     """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
 
     RANSAC PnP on matched descriptors; where few agree, on those matched where the map expects them, and once more where
@@ -147,7 +147,7 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matr
     if fit.inliers < fewest:
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
-    return Sight(
+    return ViewMatch(
         fit.T_world_camera, SURE * astray(fitter.noise) * fit.covariance, matched, fit.inliers,
         relief(sighting.points_world), overlap, fit.depth_inliers,
     )  # fmt: skip
@@ -183,7 +183,7 @@ def _solved(known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -
 def _still(sighting: Sighting, known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -> Sighting:
     """Returns a sighting without the features of a body that has moved between the views, if depths show one.
 
-    Pixels alone hardly tell a step aside with a turn from a robot before a wall that has moved.
+    Pixels alone hardly distinguish a step aside with a turn from a robot before a wall that has moved.
     """
     steady = known.steady[pairs[:, 0]] & seen.steady[pairs[:, 1]]
     points, sure = seen.points[pairs[steady, 1]].astype(np.float64), part(sighting, steady)

@@ -19,7 +19,7 @@ from dataflow.recording import RecordingWriter
 from dataflow.testing import play
 from operators.calibration.boards import Board, Charuco, Chessboard
 from operators.calibration.commands import calibrate
-from operators.calibration.recorded import Seen, images_of, own_frames, spaced_pairs
+from operators.calibration.recorded import BoardViews, images_of, own_frames, spaced_pairs
 from operators.geometry.calibration_files import camera_text
 from operators.sources import ImageFolder, StaticTransforms
 
@@ -139,7 +139,7 @@ def test_cameras_with_one_frame_get_frames_from_their_streams(
     streams: tuple[str, str], frames: tuple[str, str]
 ) -> None:
     board = Chessboard(9, 6, 0.03)
-    left, right = (Seen(name, "camera_optical", board, (320, 240), 0, ()) for name in streams)
+    left, right = (BoardViews(name, "camera_optical", board, (320, 240), 0, ()) for name in streams)
     found = own_frames(left, right)
 
     assert tuple(seen.frame for seen in found) == frames

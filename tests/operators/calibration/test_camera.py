@@ -9,7 +9,7 @@ from made_views import poses, view
 
 from operators.calibration import coverage
 from operators.calibration.boards import Chessboard, View
-from operators.calibration.camera import Fitted, Model, different, fit_camera, projected, warnings_of
+from operators.calibration.camera import CameraCalibration, Model, different, fit_camera, projected, warnings_of
 
 BOARD = Chessboard(9, 6, 0.025)
 LENS = Lens()
@@ -22,7 +22,7 @@ def views_of(lens: Lens, count: int = 30, seed: int = 3, **how: float) -> list[V
     return [v for v in found if len(set(v.ids // 9)) > 2 and len(set(v.ids % 9)) > 2]
 
 
-def fitted(lens: Lens, views: list[View], model: Model = "plumb_bob") -> Fitted:
+def fitted(lens: Lens, views: list[View], model: Model = "plumb_bob") -> CameraCalibration:
     return fit_camera(BOARD, views, "camera", (lens.width, lens.height), model)
 
 

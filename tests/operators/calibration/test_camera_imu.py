@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dataflow.messages import CameraInfo
 from operators.calibration.boards import Chessboard
-from operators.calibration.camera_imu import Mounted, Turning, fit_mount, turning_of, warnings_of
+from operators.calibration.camera_imu import CameraImuCalibration, Turning, fit_mount, turning_of, warnings_of
 
 BOARD = Chessboard(9, 6, 0.03)
 LENS = Lens()
@@ -89,7 +89,7 @@ def test_another_imu_and_too_little_are_errors() -> None:
 
 
 def test_poor_figures_are_named() -> None:
-    poor = Mounted(np.eye(3), 0.01, np.zeros(3), 0.02, 0.004, 0.1, np.ones(3), 50, 20.0)
+    poor = CameraImuCalibration(np.eye(3), 0.01, np.zeros(3), 0.02, 0.004, 0.1, np.ones(3), 50, 20.0)
     assert [text.split(":")[0] for text in warnings_of(poor)] == [
         "the rotation is known to ±1.15° only",
         "the offset is known to ±4.0 ms only",

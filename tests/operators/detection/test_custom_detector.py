@@ -570,12 +570,12 @@ def test_boxes_follow_the_pixels_through_every_variation(tmp_path: Path, seed: i
 
 
 def test_training_without_variation_sees_the_operators_input(tmp_path: Path) -> None:
-    from operators.image.letterbox import Fit
+    from operators.image.letterbox import ImageFit
 
     for size, target in (((640, 480), (320, 240)), ((200, 120), (160, 128)), ((100, 160), (160, 128))):
         pixels = cv2.resize(np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8), size)
         mine = warp(pixels, fitted(size, target), target).astype(int)
-        theirs = Fit.plan("letterbox", size, target).apply(pixels).astype(int)
+        theirs = ImageFit.plan("letterbox", size, target).apply(pixels).astype(int)
         different = np.abs(mine - theirs).max(axis=2) > 3
         assert different.mean() < 0.03  # the seam between image and border, where warping blends
 

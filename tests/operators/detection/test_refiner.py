@@ -19,12 +19,12 @@ from dataflow.messages import Image
 from operators.detection import CustomDetector
 from operators.detection.custom.closeup import closeups, moved, numbers, places, windows
 from operators.detection.custom.dataset import DetectionData, LabelledImage, labelled
-from operators.detection.custom.first_look import FirstLook, Looked
-from operators.detection.custom.refiner import Look, Refiner, look_again
+from operators.detection.custom.first_look import FirstStage, FirstStageDetections
+from operators.detection.custom.refiner import Refiner, RefinerSettings, look_again
 from operators.detection.custom.surroundings import GRID, surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.learning.augmentation import Variation
 from operators.training.options import ImageTraining
 from operators.training.refining import add_second
@@ -95,12 +95,12 @@ def refined(tmp_path_factory: pytest.TempPathFactory) -> Refined:
 
 def again(file: Path, pixels: NDArray[np.uint8], found: Candidates) -> Candidates:
     """What a file's refiner makes of boxes, by falling score."""
-    first = FirstLook(file)
+    first = FirstStage(file)
     refiner = Refiner.within(first.network)
     assert refiner is not None
     first.reveal(refiner.maps)
     looked = first.look(pixels, 0.5, 0.5, 1)
-    return refiner.refined(pixels, Looked(found, looked.inner, looked.fit), 0.5)
+    return refiner.refined(pixels, FirstStageDetections(found, looked.inner, looked.fit), 0.5)
 
 
 # ---- what it sees
@@ -168,11 +168,13 @@ def test_boxes_that_are_astray_come_to_their_objects(refined: Refined) -> None:
     assert np.mean(after) > 0.87
 
 
-def looked_at(found: Candidates) -> Looked:
-    return Looked(found, [np.zeros((1, 4, 6, 10), np.float32)], Fit.plan("letterbox", (160, 96), (160, 96)))
+def looked_at(found: Candidates) -> FirstStageDetections:
+    return FirstStageDetections(
+        found, [np.zeros((1, 4, 6, 10), np.float32)], ImageFit.plan("letterbox", (160, 96), (160, 96))
+    )
 
 
-LOOK = Look(classes=2, side=24, least=0.05, most=8)
+LOOK = RefinerSettings(classes=2, side=24, least=0.05, most=8)
 
 
 def test_boxes_that_come_to_the_same_object_are_one() -> None:
@@ -194,7 +196,7 @@ def test_only_the_best_boxes_are_looked_at_again_and_none_needs_none() -> None:
     pixels = scene(0)[0]
     boxes = np.array([[10, 10, 50, 50], [100, 10, 140, 50]], np.float32)
     found = Candidates(boxes, np.array([0.9, 0.8], np.float32), np.zeros(2, np.int32))
-    few = Look(classes=2, side=24, least=0.05, most=1)
+    few = RefinerSettings(classes=2, side=24, least=0.05, most=1)
     second = look_again(lambda *_: np.full((1, 4), 0.1, np.float32), pixels, looked_at(found), few, 0.5)
     assert np.array_equal(second.boxes[1], boxes[1])
     assert (second.boxes[0] > boxes[0]).all()
@@ -204,7 +206,7 @@ def test_only_the_best_boxes_are_looked_at_again_and_none_needs_none() -> None:
 
 def test_surroundings_are_samples_over_the_window() -> None:
     """Of a map whose value is its place: the samples lie on a grid over the window, whatever its size."""
-    fit = Fit.plan("letterbox", (320, 192), (160, 96))
+    fit = ImageFit.plan("letterbox", (320, 192), (160, 96))
     rows, columns = np.mgrid[:12, :20].astype(np.float32) + 0.5
     place = np.stack([columns * 8, rows * 8])[None]  # of each cell's middle, in the input
     shares = (np.arange(GRID) + 0.5) / GRID
@@ -227,7 +229,7 @@ def test_surroundings_of_any_window_lie_between_the_least_and_the_greatest_value
 ) -> None:
     seen = np.sort(np.array(corners, np.float32).reshape(-1, 2, 2), axis=1).reshape(-1, 4)
     map = np.random.default_rng(height * width).random((1, 3, height, width)).astype(np.float32)
-    found = surroundings([map], seen, Fit.plan("letterbox", (320, 192), (160, 96)))
+    found = surroundings([map], seen, ImageFit.plan("letterbox", (320, 192), (160, 96)))
     assert found.shape == (len(seen), GRID * GRID * 3)
     assert found.min() >= map.min() - 1e-5
     assert found.max() <= map.max() + 1e-5
@@ -235,7 +237,7 @@ def test_surroundings_of_any_window_lie_between_the_least_and_the_greatest_value
 
 def test_a_window_far_larger_than_a_small_map_has_samples_of_its_coarsest_cells() -> None:
     """A map of 6 cells is halved once, then too small: the largest window takes what the halved one has."""
-    map, fit = np.full((1, 2, 6, 6), 3.5, np.float32), Fit.plan("letterbox", (160, 96), (160, 96))
+    map, fit = np.full((1, 2, 6, 6), 3.5, np.float32), ImageFit.plan("letterbox", (160, 96), (160, 96))
     seen = np.array([[-3000, -3000, 3000, 3000]] * 50 + [[10, 10, 20, 20]], np.float32)
     assert (surroundings([map], seen, fit) == 3.5).all()
 
@@ -249,7 +251,7 @@ def test_a_detector_without_a_refiner_answers_as_its_first_look(refined: Refined
     detector.setup()
     pixels = data.validation[0].read()
     found = detector.process(Image(stamp=1, frame="camera", data=pixels))
-    first = FirstLook(plain).look(pixels, 0.001, 0.5, 100).found
+    first = FirstStage(plain).look(pixels, 0.001, 0.5, 100).found
     assert found.count > 0
     assert np.array_equal(found.boxes, first.boxes)
     assert np.array_equal(found.scores, first.scores)

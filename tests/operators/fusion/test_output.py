@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Level
-from operators.fusion.filter.gate import Doubt, Health
+from operators.fusion.filter.gate import Health, RejectedMeasurement
 from operators.fusion.output import diagnostics
 
 NOW = 100 * 10**9
-DOUBT = Doubt(NOW, np.ones(3), np.eye(3), "Position")
+DOUBT = RejectedMeasurement(NOW, np.ones(3), np.eye(3), "Position")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from made_graphs import scene_graph
 from dataflow.messages import Detections2D, SceneGraph
 from operators.labels import LabelSpace, labels_file
 from operators.scene.relations import FLOOR
-from operators.scene.scoring import PlainlySeen, RelationScore, score_nodes
+from operators.scene.scoring import RelationScore, VisibleImages, score_nodes
 
 
 def graph(nodes: dict[int, tuple[str, float]], relations: list[tuple[int, str, int]]) -> SceneGraph:
@@ -90,7 +90,7 @@ def in_image(second: int, ids: list[int]) -> Detections2D:
 
 def test_map_must_contain_plainly_seen_objects_and_visible_movers() -> None:
     """The table (12) is seen from the third second on, the ball (13) up to the fourth, the mug (11) always."""
-    seen, must = PlainlySeen(images=3), []
+    seen, must = VisibleImages(images=3), []
     labels = LabelSpace.read(Path(labels_file("simulator")))
     for second in range(8):
         seen.add(in_image(second, [11, *([12] if second >= 3 else []), *([13] if second <= 4 else [])]))

@@ -15,7 +15,7 @@ from interrupted import trained_twice
 from numpy.typing import NDArray
 
 from dataflow.messages import Image
-from operators.image.letterbox import Fit
+from operators.image.letterbox import ImageFit
 from operators.learning.augmentation import Variation
 from operators.segmentation import Segmenter
 from operators.segmentation.borders import BLOCK, Blocks, best_cells, found_blocks, look_again, worked
@@ -100,7 +100,7 @@ def true_sides(mask: Pixels, blocks: Blocks) -> NDArray[np.float32]:
 
 def test_every_block_with_two_classes_is_looked_at_and_shows_its_pixels() -> None:
     pixels, mask = scene(3)
-    fit = Fit.plan("letterbox", SIZE, (192, 144))
+    fit = ImageFit.plan("letterbox", SIZE, (192, 144))
     shown, placed = worked(pixels, fit)
     scores = coarse_scores(mask, (96, 72))
     coarse, blocks = found_blocks(scores, 0.1, *best_cells(scores), shown, placed)
@@ -121,7 +121,7 @@ def test_preferences_lie_where_the_pixels_are() -> None:
     mask = np.zeros((96, 128), np.uint8)
     mask[:, 61:] = 1
     pixels = COLORS[mask]
-    fit = Fit.plan("letterbox", (128, 96), (128, 96))
+    fit = ImageFit.plan("letterbox", (128, 96), (128, 96))
     scores = np.stack([200 - mask[::2, ::2] * 100, 100 + mask[::2, ::2] * 100]).astype(np.uint8)
     shown, placed = worked(pixels, fit)
     _, blocks = found_blocks(scores, 0.1, *best_cells(scores), shown, placed)
@@ -136,7 +136,7 @@ def test_preferences_lie_where_the_pixels_are() -> None:
 def test_a_block_at_the_images_border_is_whole() -> None:
     pixels, mask = scene(4)
     pixels, mask = pixels[:187, :251], mask[:187, :251]  # not a multiple of a block
-    fit = Fit.plan("letterbox", (251, 187), (192, 144))
+    fit = ImageFit.plan("letterbox", (251, 187), (192, 144))
     scores = coarse_scores(mask, (96, 72))
     found = look_again(lambda blocks: np.ones((len(blocks.at), 16), np.float32), scores, 0.1, pixels, fit)
     assert found.shape == mask.shape
@@ -146,7 +146,7 @@ def test_a_block_at_the_images_border_is_whole() -> None:
 @settings(max_examples=30, deadline=None)
 def test_images_of_any_size_get_classes_of_theirs(width: int, height: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    fit = Fit.plan("letterbox", (width, height), (32, 32))
+    fit = ImageFit.plan("letterbox", (width, height), (32, 32))
     scores = rng.integers(0, 256, (4, 16, 16)).astype(np.uint8)
     pixels = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     sides = rng.normal(size=(10_000, 16)).astype(np.float32)
@@ -161,7 +161,7 @@ def test_images_of_any_size_get_classes_of_theirs(width: int, height: int, seed:
 def test_right_answers_give_the_true_mask_but_for_third_classes() -> None:
     for seed in range(5):
         pixels, mask = scene(seed)
-        fit = Fit.plan("letterbox", SIZE, (192, 144))
+        fit = ImageFit.plan("letterbox", SIZE, (192, 144))
         scores = coarse_scores(mask, (96, 72))
         found = look_again(partial(true_sides, mask), scores, 0.1, pixels, fit)
         assert (found != mask).mean() < 0.002
@@ -177,7 +177,7 @@ def test_one_class_alone_needs_no_second_look() -> None:
         raise AssertionError
 
     found = look_again(
-        never, scores, 0.1, np.zeros((96, 128, 3), np.uint8), Fit.plan("letterbox", (128, 96), (128, 96))
+        never, scores, 0.1, np.zeros((96, 128, 3), np.uint8), ImageFit.plan("letterbox", (128, 96), (128, 96))
     )
     assert (found == 1).all()
 

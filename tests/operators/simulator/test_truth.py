@@ -15,12 +15,12 @@ from dataflow.messages import Boxes3D, Detections2D, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_points
 from operators.simulator import SimulatedRobot
 from operators.simulator.classes import ACTIVITIES, THINGS
-from operators.simulator.people.movers import Carried
+from operators.simulator.people.movers import CarriedObject
 from operators.simulator.people.persons import Person
 from operators.simulator.relations import PLACEMENT, SPATIAL
 from operators.simulator.rendering.optics import Optics
 from operators.simulator.rendering.renderer import Renderer
-from operators.simulator.scene import Builder, Light, Still, World
+from operators.simulator.scene import Builder, Light, Stationary, World
 from operators.simulator.shapes import Material, bounds, box, pose
 from operators.simulator.things.furnishing import FLOOR
 from operators.simulator.things.furniture import rover
@@ -243,7 +243,7 @@ def test_degrees_of_nearness_follow_their_written_thresholds(
 def test_placement_does_not_depend_on_where_things_are(robot: SimulatedRobot) -> None:
     """Objects set far apart keep their relations of placement: no distance decides them."""
     world = robot._stage.world
-    away = [replace(thing, mover=Still(pose(50.0 * k, 0, 0))) for k, thing in enumerate(world.things)]
+    away = [replace(thing, mover=Stationary(pose(50.0 * k, 0, 0))) for k, thing in enumerate(world.things)]
     assert replace(world, things=tuple(away)).relations(0.0) == world.relations(0.0)
 
 
@@ -253,7 +253,7 @@ def test_every_world_has_many_classes_movers_and_goals(name: str) -> None:
     world = make_world(name, 5, speed=0.5, hold=0.0, movers=True)
     assert len({thing.label for thing in world.objects()}) >= 10
     assert {thing.id for thing in world.objects()} == set(range(1, len(world.objects()) + 1))
-    movers = {thing.id for thing in world.objects() if not thing.still and not isinstance(thing.mover, Carried)}
+    movers = {thing.id for thing in world.objects() if not thing.still and not isinstance(thing.mover, CarriedObject)}
     assert movers
     for t in np.arange(0, 60, 1.5):
         doings = world.doings(float(t))

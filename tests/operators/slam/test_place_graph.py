@@ -13,7 +13,7 @@ from operators.geometry.se3 import Matrix
 from operators.slam.keyframe_graph import Node
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.visual.graph import GraphSettings
-from operators.slam.visual.view import Sight
+from operators.slam.visual.view import ViewMatch
 
 
 class Eyes:
@@ -25,9 +25,9 @@ class Eyes:
     def distance(self, T_a: Matrix, T_b: Matrix) -> float:
         return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
 
-    def sight(self, nodes: Mapping[int, Node[str]], known: int, seen: int, expected: bool) -> Sight:
+    def sight(self, nodes: Mapping[int, Node[str]], known: int, seen: int, expected: bool) -> ViewMatch:
         T = invert(nodes[known].T_odom) @ nodes[seen].T_odom @ self._off
-        return Sight(T, 1e-6 * np.eye(6), 90, 60, 30, 0.8, 0.95)
+        return ViewMatch(T, 1e-6 * np.eye(6), 90, 60, 30, 0.8, 0.95)
 
 
 class NoLooks:

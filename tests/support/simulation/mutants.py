@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dataflow.execution.admission import AdmissionQueue, Patience
+from dataflow.execution.admission import AdmissionQueue, WaitLimits
 from dataflow.execution.calls import Calls
 from dataflow.execution.feeds.window import Window
 from dataflow.execution.live import LiveRunner
@@ -16,10 +16,10 @@ from dataflow.execution.log import FiringLog
 from dataflow.execution.ports import OutputPorts
 from dataflow.execution.runner import OperatorRunner
 from dataflow.machines.pipe import _END, _FRAME, Pipe
-from dataflow.process.awake import AwakeClock
+from dataflow.process.awake_clock import AwakeClock
 from dataflow.process.channel import ChannelClosed, QueuedChannel
-from dataflow.process.streams.losses import LossTold
-from dataflow.sinks.flight_recorder import FlightSink, Wanted
+from dataflow.process.streams.losses import LossReportingPolicy
+from dataflow.sinks.flight_recorder import FlightSink, PendingSpan
 from dataflow.sinks.parts import PartsSink
 from dataflow.sinks.triggers import Triggers
 from dataflow.sync import FOREVER, NEVER
@@ -99,7 +99,7 @@ def high_frontier() -> Methods:
 def spinning_wait() -> Methods:
     """A live operator gives up waiting for a static stream, which cannot be given up: it spins."""
 
-    def exhausted(self: Patience, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
+    def exhausted(self: WaitLimits, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
         if stamp != self._stamp:
             self._stamp, self._since = stamp, self.clock()
         return {
@@ -118,7 +118,7 @@ def spinning_wait() -> Methods:
             self._timeouts[name] += 1
         return bool(given_up)
 
-    return {(Patience, "exhausted"): exhausted, (LiveRunner, "_give_up"): give_up}
+    return {(WaitLimits, "exhausted"): exhausted, (LiveRunner, "_give_up"): give_up}
 
 
 def blocking_supervisor() -> Methods:
@@ -188,7 +188,7 @@ def short_memory() -> Methods:
     """A flight recorder keeps half of what was before a trigger."""
     right = FlightSink._keep
 
-    def keep(self: FlightSink, wanted: Wanted, outcome: str = "") -> None:
+    def keep(self: FlightSink, wanted: PendingSpan, outcome: str = "") -> None:
         wanted.start += self.flight.keep // 2
         right(self, wanted, outcome)
 
@@ -207,7 +207,9 @@ MUTANTS: Mapping[str, Mutant] = {
     "frontier": Mutant("a frontier is too high", high_frontier),
     "static_wait": Mutant("an operator spins on a static input that has not come", spinning_wait),
     "frozen": Mutant("the supervisor waits for a process that is frozen", blocking_supervisor),
-    "gap": Mutant("a gap is not counted", always(LossTold, "lost", lambda self, stream, first, following: None)),
+    "gap": Mutant(
+        "a gap is not counted", always(LossReportingPolicy, "lost", lambda self, stream, first, following: None)
+    ),
     "drop": Mutant("a drop is not recorded", always(AdmissionQueue, "_drop", lambda self, *dropped: None)),
     "itself": Mutant("an operator does not notice what it gives to itself", deaf_to_itself),
     "pause": Mutant("a pause counts against processes", always(AwakeClock, "__call__", lambda self: self._clock())),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dataflow.process.channel import QueuedChannel
-from dataflow.supervision.nursery import Child, End, Leftovers
+from dataflow.supervision.nursery import Child, ChildExited, Orphans
 from dataflow.supervision.process_main import main
 from simulation.machine import End as PipeEnd
 from simulation.machine import Handle, Socket, System, Waiters
@@ -23,7 +23,7 @@ class Nursery:
     def __init__(self, system: System, named: Callable[[Child], str], born: Callable[[Process], None]) -> None:
         """`named` gives the label of a child, `born` is told of each process before it does anything."""
         self._system, self._world, self._named, self._born = system, system.world, named, born
-        self._news: deque[Callable[[], End | None]] = deque()
+        self._news: deque[Callable[[], ChildExited | None]] = deque()
         self._changed = Waiters(self._world)
         self.waiters = (self._changed,)
         self.writable = False
@@ -50,7 +50,7 @@ class Nursery:
         assert isinstance(theirs, Socket)
         process.closers += [theirs.close, lambda: self._system.close(writing.descriptor)]
         process.on_line = lambda text: writing.pipe.write(f"{text}\n".encode())
-        process.on_end = lambda code: self._tell(lambda: End(child, code))
+        process.on_end = lambda code: self._tell(lambda: ChildExited(child, code))
         self._tell(lambda: child.born(process.pid, handle.descriptor))
         self._born(process)
         world.start("main", process, lambda: _live(world, process, child.channel.theirs, handed))
@@ -65,9 +65,9 @@ class Nursery:
         self._due = max(getattr(self, "_due", 0.0), self._world.now + self._world.latency())
         self._world.at(self._due, arrive)
 
-    def receive(self) -> list[End | Leftovers]:
+    def receive(self) -> list[ChildExited | Orphans]:
         self._world.call()
-        found: list[End | Leftovers] = []
+        found: list[ChildExited | Orphans] = []
         while self._news:
             if (end := self._news.popleft()()) is not None:
                 found.append(end)

@@ -62,8 +62,8 @@ def imported(use: str) -> Any:
     return revised(operator, Files.revision)
 
 
-class Replaced:
-    """Stands for `dataflow.graph.code.Replaced`."""
+class ReloadedCode:
+    """Stands for `dataflow.graph.code.ReloadedCode`."""
 
     def __init__(self, node: Node, before: Code) -> None:
         operator: Any = node.operator
@@ -100,7 +100,7 @@ def leave_files(path: Path) -> None:
 
 def bindings() -> Bindings:
     return {
-        ("dataflow.execution.live", "Replaced"): Replaced,
+        ("dataflow.execution.live", "ReloadedCode"): ReloadedCode,
         ("dataflow.execution.live", "code_now"): code_now,
         ("dataflow.execution.log", "code_now"): code_now,
         ("dataflow.execution.source", "code_now"): code_now,

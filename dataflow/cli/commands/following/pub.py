@@ -19,7 +19,7 @@ from dataflow.cli.support.options import argument, option
 from dataflow.cli.support.output import INTERRUPTED, fail, out, print_json_line
 
 if TYPE_CHECKING:
-    from dataflow.client.processes import Processes, Taker
+    from dataflow.client.processes import Processes, PublishTarget
     from dataflow.messages import Message
 
 OURS = ("stream", "type")
@@ -75,7 +75,7 @@ def pub(
             raise typer.Exit(INTERRUPTED) from None
 
 
-def _taker(processes: Processes, operator: str, known: Iterable[str], number: int, timeout: float) -> Taker:
+def _taker(processes: Processes, operator: str, known: Iterable[str], number: int, timeout: float) -> PublishTarget:
     """The source of that name, asked for until all processes are reached."""
     from dataflow.graph.problems import did_you_mean
 
@@ -140,7 +140,7 @@ def _paced(messages: Iterator[Message], rate: float | None) -> Iterator[Message]
         yield message
 
 
-def _say(operator: str, taker: Taker, stamp: int, *, json: bool) -> None:
+def _say(operator: str, taker: PublishTarget, stamp: int, *, json: bool) -> None:
     from dataflow.sync.stamps import format_stamp
 
     stream = f"{operator}/{taker.port}"

@@ -37,7 +37,7 @@ def reload(
       dataflow reload front/cloud --graph two_cameras
     """
     from dataflow.client.attach import graph_of, with_keys_of_tools
-    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.client.processes import NoAnswer, RequestRejected, processes_of
     from dataflow.graph.problems import did_you_mean
 
     found = which.found()
@@ -52,7 +52,7 @@ def reload(
             if (machine := nodes[operator].machine) is not None:
                 _require_same_files(processes.files(operator, timeout), machine)
             outcome = processes.reload(operator, timeout)
-        except (Refused, NoAnswer) as error:
+        except (RequestRejected, NoAnswer) as error:
             raise fail(f"{operator} is not reloaded: {error}", code=DIFFERENT) from None
     if outcome["warning"]:
         say(escape(outcome["warning"]))
@@ -66,13 +66,15 @@ def reload(
 
 
 def _require_same_files(there: Mapping[str, str], machine: str) -> None:
-    """Raises `Refused` where files of an operator's modules differ here, where they were edited, and on its machine;
-    files that are not found here are not compared."""
-    from dataflow.client.processes import Refused
+    """Raises `RequestRejected` where files of an operator's modules differ between here, where they were edited, and
+    its machine; files that are not found here are not compared."""
+    from dataflow.client.processes import RequestRejected
     from dataflow.graph.code import file_digests
 
     find_modules_in(None)
     here = file_digests(there)
     if differing := [name for name, digest in sorted(there.items()) if here.get(name, digest) != digest]:
         which = ", ".join(differing)
-        raise Refused(f"{which} on machine {machine!r} differs from here: install it there first, the old code goes on")
+        raise RequestRejected(
+            f"{which} on machine {machine!r} differs from here: install it there first, the old code goes on"
+        )

@@ -82,7 +82,7 @@ def _target(to: str, overwrite: bool) -> Callable[[str], int]:
 def _export(recording: Path, write: Callable[[str], int], to: str) -> None:
     from dataflow.analysis.latency import records_of
     from dataflow.analysis.spans import Spans
-    from dataflow.client.span_sender import Refused
+    from dataflow.client.span_sender import SpansRejected
     from dataflow.recording import Recording
     from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
@@ -97,7 +97,7 @@ def _export(recording: Path, write: Callable[[str], int], to: str) -> None:
         for line in Spans(graph).lines(records_of(opened, graph)):
             try:
                 refused = write(line.text)
-            except (OSError, Refused) as error:
+            except (OSError, SpansRejected) as error:
                 raise fail(f"{to}: {getattr(error, 'reason', None) or error}; {count(sent)} spans were sent") from None
             sent, lost = sent + line.spans - refused, lost + refused
     say(f"{count(sent)} spans to {escape(to)}" + (f"; {count(lost)} were refused" if lost else ""))

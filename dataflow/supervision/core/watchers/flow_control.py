@@ -16,8 +16,8 @@ from dataflow.supervision.core.watchers.watcher import Watcher
 from dataflow.sync import FOREVER, NEVER
 
 
-class Cover(Watcher):
-    """Takes in how far each process is, and recomputes what sources are told when that changes."""
+class FlowControl(Watcher):
+    """Takes in how far each process is, and recomputes what is sent to sources when that changes."""
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind == "progress":
@@ -35,7 +35,7 @@ class Cover(Watcher):
         raise NotImplementedError
 
 
-class LosslessCover(Cover):
+class LosslessFlowControl(FlowControl):
     """The least stamp that every operator and every sink has done: sources wait for all."""
 
     def __init__(self, run: RunState) -> None:
@@ -61,7 +61,7 @@ class LosslessCover(Cover):
                 run.send(process, "covered", replaces=True, frontier=covered)
 
 
-class LiveCover(Cover):
+class LiveFlowControl(FlowControl):
     """Computes how far the operators that sources wait for are behind (the window), and how far any is (the backlog).
 
     An operator does not count while its process is away or gives no sign of life. A new process owes nothing of what

@@ -1,7 +1,7 @@
 """The watch over single processes of a live run: their signs of life, deadlines, memory, and hanging calls.
 
 Who breaks a rule is killed, and started again by its restart policy. Without a policy a process that gives no sign of
-life is no longer waited for: the graph goes on without it until it is heard again.
+life is no longer waited for: the graph goes on without it until it reports again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataflow.supervision.core.life import WORKS, Life
 from dataflow.supervision.core.report import RunFailed
 from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.supervised import Supervised
-from dataflow.supervision.core.watchers.flow_control import LiveCover
+from dataflow.supervision.core.watchers.flow_control import LiveFlowControl
 from dataflow.supervision.core.watchers.restarts import RestartPolicy
 from dataflow.supervision.core.watchers.watcher import Watcher
 
@@ -25,7 +25,7 @@ HUNG_AFTER = 5.0
 class Heartbeats(Watcher):
     """Takes in what the watchdogs of the processes say."""
 
-    def __init__(self, run: RunState, cover: LiveCover, restarts: RestartPolicy) -> None:
+    def __init__(self, run: RunState, cover: LiveFlowControl, restarts: RestartPolicy) -> None:
         super().__init__(run)
         self._cover, self._restarts = cover, restarts
         self._beats: dict[str, float] = {}
@@ -79,7 +79,7 @@ class Heartbeats(Watcher):
         process.work = None if fields["work"] is None else tuple(fields["work"])
         if process.silent:
             process.silent = False
-            self.run.event("heard", f"{process.describe()} is heard again", operators=list(process.nodes))
+            self.run.event("heard", f"{process.describe()} reports again", operators=list(process.nodes))
             self._cover.heard_again(process)
         self._check_memory(process, fields["memory"])
 

@@ -1,4 +1,4 @@
-"""Sources of a live run against the clock: who falls behind it, and who waits for it without end.
+"""Sources of a live run against the clock: which fall behind it, and which wait for it without end.
 
 A source that can wait (a data set, a simulator) is read at the pace of the clock. Where that takes longer than real
 time, event time falls behind, and everything after it looks healthy; so it is said, at once and at the end.
@@ -28,7 +28,7 @@ IDLE = 0.05
 
 
 def held_up_by(others: Sequence[str], read: float, sent: float, load: float, wall: float) -> str:
-    """Names who holds a source up.
+    """Names what holds a source up.
 
     `others`: the other operators of its process; `read`, `sent`: seconds by which its last message was late when it was
     read, and when it was sent; `load`, `wall`: CPU time and time that reading it took, as shares of what has passed.

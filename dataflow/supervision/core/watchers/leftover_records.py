@@ -1,11 +1,11 @@
-"""Remains of processes of a live run that have ended: firing records for the recorder, and where others go on."""
+"""Firing records of processes of a live run that have ended: for the recorder, and where others go on."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from dataflow.records.black_box import Reached, Remains
+from dataflow.records.black_box import OperatorProgress, RecoveredRecords
 from dataflow.supervision.core.life import WORKS
 from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.supervised import Supervised
@@ -21,10 +21,10 @@ class LeftoverRecords(Watcher):
     def __init__(self, run: RunState) -> None:
         super().__init__(run)
         self._batches: dict[str, list[bytes]] = {}
-        self._reached: dict[str, Reached] = {}
+        self._reached: dict[str, OperatorProgress] = {}
         self._lacking: set[str] = set()  # operators of which records were lost, and whose process can send none
 
-    def remained(self, process: Supervised, remains: Remains) -> None:
+    def remained(self, process: Supervised, remains: RecoveredRecords) -> None:
         for name in process.nodes:
             self._batches[name] = list(remains.batches[name][-HANDED_OVER:])
             self._reached[name] = remains.reached[name]
@@ -57,8 +57,8 @@ class LeftoverRecords(Watcher):
                 self.run.tell_recorder("records", batches=batches)
 
     def resumed(self, operator: str) -> dict[str, Any]:
-        """Returns what the next process of this operator begins with: fields of `Resumed`, as plain values."""
-        reached = self._reached.get(operator, Reached())
+        """Returns what the next process of this operator begins with: fields of `ResumeState`, as plain values."""
+        reached = self._reached.get(operator, OperatorProgress())
         return {
             "incarnation": reached.incarnation + 1,
             "last": reached.last,

@@ -1,4 +1,4 @@
-"""Restarts of processes in a live run: who may come back, how often, and how it takes part again.
+"""Restarts of processes in a live run: which may come back, how often, and how they take part again.
 
 The rule: a process that dies, that is killed for breaking a rule, that cannot set up its operators, or that fails
 itself, is restarted by its policy, the strictest of its operators', whether it works or is still being started. An

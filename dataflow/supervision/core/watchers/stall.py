@@ -1,4 +1,4 @@
-"""The watch over runs in which nothing happens: who holds them up is named, and the run ends."""
+"""The watch over runs in which nothing happens: what holds them up is named, and the run ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from dataflow.supervision.core.life import WORKS
 from dataflow.supervision.core.report import RunFailed
-from dataflow.supervision.core.run_state import Asking, RunState, notice
+from dataflow.supervision.core.run_state import RunState, StackTraceRequests, notice
 from dataflow.supervision.core.supervised import Supervised
 from dataflow.supervision.core.watchers.lateness import how_long
 from dataflow.supervision.core.watchers.quiescence import Quiescence
@@ -26,7 +26,7 @@ class StallWatch(Watcher):
         super().__init__(run)
         self.quiescence = quiescence
         self._heard = 0.0
-        self._asking = Asking(run)
+        self._asking = StackTraceRequests(run)
 
     def released(self) -> None:
         self._heard = self.run.steady
@@ -65,7 +65,7 @@ class StallWatch(Watcher):
             raise RunFailed(f"{process.describe()} has read nothing for {seconds:.0f} s", words)
 
     def _stuck(self, seconds: float) -> list[Supervised]:
-        """Returns those who hold up the run for so long: who does not answer, else who has not ended."""
+        """Returns those that hold up the run for so long: which do not answer, else which have not ended."""
         if self.run.steady - self._heard <= seconds:
             return []
         return self.quiescence.unanswered() or [p for p in self.run.working() if p.report is None]
@@ -91,7 +91,7 @@ class LiveStallWatch(StallWatch):
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run, quiescence)
         self._signs: dict[str, float] = {}
-        self._asking_silent = Asking(run)
+        self._asking_silent = StackTraceRequests(run)
         graph = run.graph
         self._flowing = {s for node in graph.sources() for s in node.outputs.values() if not graph.streams[s].static}
         """The streams of sources that have not ended."""
@@ -111,7 +111,7 @@ class LiveStallWatch(StallWatch):
             self._flowing.discard(fields["stream"])
 
     def _stuck(self, seconds: float) -> list[Supervised]:
-        """Returns those who are at one call for so long."""
+        """Returns those that are at one call for so long."""
         return [p for p in self.run.working() if p.work is not None and p.work[2] >= seconds]
 
     def _stuck_since(self, process: Supervised) -> object:

@@ -1,11 +1,11 @@
-"""A part of the supervisor's core: it is told what happens, and acts through the run's state."""
+"""A part of the supervisor's core: it is notified of what happens, and acts through the run's state."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.records.black_box import Remains
+from dataflow.records.black_box import RecoveredRecords
 from dataflow.supervision.core.run_state import RunState
 from dataflow.supervision.core.supervised import Supervised
 
@@ -22,7 +22,7 @@ class Watcher:
     def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
         """A process has not read its control channel for a while."""
 
-    def remained(self, process: Supervised, remains: Remains) -> None:
+    def remained(self, process: Supervised, remains: RecoveredRecords) -> None:
         """A process has ended, and left these firing records."""
 
     def released(self) -> None:

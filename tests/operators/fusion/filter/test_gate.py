@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from operators.fusion.filter.error_state import SIZE, VELOCITY, State
-from operators.fusion.filter.gate import Doubt, GateConfig, Health, Repeat, leap, repeat_of
+from operators.fusion.filter.gate import GateConfig, Health, RejectedMeasurement, Repeat, leap, repeat_of
 from operators.fusion.filter.measurements import AngularRate, FullPose, Measurement, Model, Position
 
 NOISE = np.eye(3) * 1e-4
-FELT = Doubt(10**9, np.array([0.6, 0.0, 0.0]), NOISE, "Velocity")
+FELT = RejectedMeasurement(10**9, np.array([0.6, 0.0, 0.0]), NOISE, "Velocity")
 LEAPT = {"wheels": Health(last_used=10**9, doubts=(FELT,), streak=3, leap=0.6)}
 
 
@@ -20,7 +20,7 @@ def leapt(sensor: str, kind: str, seconds: float, health: dict[str, Health], res
     state = State(none, none, np.eye(3), none, none, np.eye(15) * 1e-6)
     H = np.zeros((3, 15))
     H[:, VELOCITY] = np.eye(3)
-    doubt = Doubt(round((1.0 + seconds) * 1e9), np.array([residual, 0.0, 0.0]), NOISE, kind)
+    doubt = RejectedMeasurement(round((1.0 + seconds) * 1e9), np.array([residual, 0.0, 0.0]), NOISE, kind)
     return leap(GateConfig(), sensor, doubt, health, state, H, residual**2 / 1e-4, 1.0)
 
 
@@ -48,9 +48,9 @@ def test_fitting_other_or_later_measurements_do_not_leap() -> None:
 def test_leap_to_a_place_that_another_kind_of_sensor_gives_as_well_is_none(
     kind: str, seconds: float, place: float, size: float
 ) -> None:
-    there = Doubt(10**9, np.array([place, 0.0, 0.0]), NOISE, kind)
+    there = RejectedMeasurement(10**9, np.array([place, 0.0, 0.0]), NOISE, kind)
     others = {"camera": Health(last_used=10**8, doubts=(there,), streak=3)}
-    own = Doubt(10**9, np.array([0.6, 0.0, 0.0]), NOISE, "Position")
+    own = RejectedMeasurement(10**9, np.array([0.6, 0.0, 0.0]), NOISE, "Position")
     health = {"gps": Health(last_used=10**9, doubts=(own,), streak=1, leap=0.6), **others}
     assert leapt("gps", "Position", seconds, health) == pytest.approx(size)
 

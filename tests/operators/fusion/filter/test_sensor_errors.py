@@ -20,7 +20,7 @@ from operators.fusion.filter.history import Sample
 from operators.fusion.filter.initialisation import Prior, first_node
 from operators.fusion.filter.measurements import AngularRate, Measurement, Model, Orientation, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
-from operators.fusion.sensors.interpretation import Surroundings, measurements
+from operators.fusion.sensors.interpretation import MeasurementContext, measurements
 from operators.fusion.sensors.settings import SensorSettings, errors_of
 
 MOTION = Motion()
@@ -127,7 +127,7 @@ def test_settings_enable_error_states_and_reduce_the_noise() -> None:
     errors = errors_of(settings)
     assert errors.sigmas == [0.05, 0.3, 0.3, 0.6, 0.02]
     np.testing.assert_allclose(errors.wander.decay, [0.0, 0.05, 0.05, 0.05, 0.0])
-    around = Surroundings(lambda frame: np.eye(4), "world", (48.0, 11.0, 500.0))
+    around = MeasurementContext(lambda frame: np.eye(4), "world", (48.0, 11.0, 500.0))
     C = np.diag([0.25, 0.25, 1.0])
     fix = NavSatFix(
         stamp=5, frame="gnss", latitude=48.0, longitude=11.0, altitude=500.0, satellites=9,

@@ -22,7 +22,7 @@ from operators.fusion.filter.error_state_filter import ErrorStateFilter, FilterC
 from operators.fusion.filter.history import Hypothesis, Node, Sample
 from operators.fusion.filter.measurements import Measurement, Position, Velocity
 from operators.fusion.filter.sensor_errors import SensorErrors
-from operators.fusion.filter.suspicions import LATE, SCALE, Fit, Suspicions, suspected
+from operators.fusion.filter.suspicions import LATE, SCALE, Suspicions, WindowFit, suspected
 from operators.fusion.filter.window import Motion, Window
 
 NOISE = Noise(1e-3, 1e-2, 1e-5, 1e-4)
@@ -177,7 +177,7 @@ def test_filter_older_than_the_window_restarts_on_stronger_evidence_only(old: bo
     for k in range(1, 5):
         fused.feel(Sample(k * 10**8, ZERO, -DOWN, NOISE))
     end = replace(ones, rotation=exp_rotation(np.array([0.0, 0.0, off])))
-    fit = Fit(0, ones, np.zeros(0), until=4 * 10**8, end=end)
+    fit = WindowFit(0, ones, np.zeros(0), until=4 * 10**8, end=end)
     fused._suspicions = SimpleNamespace(look=lambda *_: fit, found=None)
     fused.look()
     assert (fused.restarted == 4 * 10**8) == restarts
@@ -193,7 +193,8 @@ def test_a_window_that_slides_asks_for_five_standard_deviations(old: bool, sigma
     def fitted(gain: float) -> None:
         size = np.array([0.07 * gain**0.5])
         fits = {
-            erring: Fit(0, ones, size, 200 - gain * erring, size * 0 + 0.07, 200, promise=gain) for erring in (0, 1)
+            erring: WindowFit(0, ones, size, 200 - gain * erring, size * 0 + 0.07, 200, promise=gain)
+            for erring in (0, 1)
         }
         made._fitted = lambda window, erring: fits[erring]
         made.look(made._looked + 10**10, window)

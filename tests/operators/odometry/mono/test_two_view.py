@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import transform_points
 from operators.geometry import se3
 from operators.geometry.pinhole import project
-from operators.odometry.mono.two_view import TwoViewConfig, TwoViews, Unsolved, triangulate, turned, two_views
+from operators.odometry.mono.two_view import TwoViewConfig, TwoViewFailure, TwoViews, triangulate, turned, two_views
 
 Array = NDArray[np.float64]
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
@@ -74,7 +74,7 @@ def test_a_wall_allows_two_motions_and_is_never_taken_wrongly() -> None:
         answers.append(two_views(*seen(on_wall(rng), T, rng), K, CONFIG))
         if isinstance(answers[-1], TwoViews):
             assert max(off(answers[-1], T)) < 5.0
-    assert Unsolved.AMBIGUOUS in answers
+    assert TwoViewFailure.AMBIGUOUS in answers
 
 
 @settings(max_examples=25, deadline=None)
@@ -87,22 +87,22 @@ def test_a_turn_on_the_spot_never_gives_a_motion(axis: tuple[float, float, float
     rng = np.random.default_rng(3)
     T = se3.exp(np.concatenate([np.zeros(3), angle * np.array(axis) / np.linalg.norm(axis)]))
     found = two_views(*seen((on_wall if flat else scattered)(rng), T, rng), K, CONFIG)
-    assert found in (Unsolved.ROTATION, Unsolved.STILL)
+    assert found in (TwoViewFailure.ROTATION, TwoViewFailure.STILL)
 
 
 def test_a_camera_that_stands_and_a_view_of_little_are_named() -> None:
     rng = np.random.default_rng(4)
     points = scattered(rng)
-    assert two_views(*seen(points, np.eye(4), rng), K, CONFIG) is Unsolved.STILL
+    assert two_views(*seen(points, np.eye(4), rng), K, CONFIG) is TwoViewFailure.STILL
     aside = se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert two_views(*seen(points[:30], aside, rng), K, CONFIG) is Unsolved.FEW
+    assert two_views(*seen(points[:30], aside, rng), K, CONFIG) is TwoViewFailure.FEW
 
 
 def test_corners_that_move_at_random_agree_on_nothing() -> None:
     rng = np.random.default_rng(5)
     first = rng.uniform([0, 0], [640, 480], (200, 2))
     found = two_views(first, rng.uniform([0, 0], [640, 480], (200, 2)), K, CONFIG)
-    assert isinstance(found, Unsolved)
+    assert isinstance(found, TwoViewFailure)
 
 
 def test_the_same_views_give_the_same_bytes() -> None:

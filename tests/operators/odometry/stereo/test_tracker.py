@@ -21,7 +21,7 @@ from operators.geometry.pinhole import Points, project
 from operators.odometry import StereoVisualOdometry
 from operators.odometry.stereo.adjustment import Offset, Past, adjust, fitting
 from operators.odometry.stereo.odometry import rig_of
-from operators.odometry.stereo.relocalizer import FoundAgain, StereoKeyframe, StereoRelocalizer, kept_pair
+from operators.odometry.stereo.relocalizer import RelocalizedPose, StereoKeyframe, StereoRelocalizer, kept_pair
 from operators.odometry.stereo.settings import StereoOdometryConfig
 from operators.odometry.stereo.tracker import StereoOdometry
 from operators.odometry.tracking import Status, TrackResult
@@ -246,7 +246,7 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
 ) -> None:
     """What is found is given here: nothing for three frames, and then the place."""
     pairs, poses = sequence(25)
-    dark, found = (np.zeros_like(pairs[0][0]),) * 2, list[FoundAgain]()
+    dark, found = (np.zeros_like(pairs[0][0]),) * 2, list[RelocalizedPose]()
     monkeypatch.setattr(StereoRelocalizer, "found", lambda *_: iter(found))
     monkeypatch.setattr(StereoRelocalizer, "believed", lambda *_: False)
     odometry = StereoOdometry(RIG)
@@ -264,7 +264,7 @@ def test_a_new_map_begins_after_a_gap_and_goes_where_the_view_is_found(
 
     later = 1_700_000_000 if tracked else 2_500_000_000
     known = odometry.state.map.keyframes[0]
-    found.append(FoundAgain(poses[17], 1e-4 * np.eye(6), 999, known))
+    found.append(RelocalizedPose(poses[17], 1e-4 * np.eye(6), 999, known))
     back = odometry.track(*pairs[17], later)
     found.clear()
     after = odometry.track(*pairs[18], later + 100_000_000)

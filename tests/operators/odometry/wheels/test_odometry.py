@@ -214,7 +214,7 @@ def test_each_side_is_the_mean_of_its_wheels_and_messages_know_their_own_scale()
     ("params", "text"),
     [
         ({"left": ("port",)}, "no wheel 'port'; there are left, right"),
-        ({"radius": None}, "does not tell the wheels' radius: set the parameter radius"),
+        ({"radius": None}, "lacks the wheels' radius: set the parameter radius"),
         ({"ticks_per_turn": None}, "set the parameter ticks_per_turn"),
         ({"left": ("right",)}, "wheel 'right' is on both sides"),
     ],

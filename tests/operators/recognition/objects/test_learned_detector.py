@@ -15,7 +15,13 @@ from dataflow.messages import Image
 from dataflow.testing import play
 from operators.detection import CustomDetector
 from operators.recognition import LearnedDetector
-from operators.recognition.objects.learned_object import LearnedObject, LearnedObjectError, Shown, learn, shown_in
+from operators.recognition.objects.learned_object import (
+    ImageExamples,
+    LearnedObject,
+    LearnedObjectError,
+    learn,
+    shown_in,
+)
 from operators.recognition.objects.proposals import Trunk, inner_maps
 from operators.scene.map.file import LearnedFile, SavedMap
 from operators.training.learning import learn as command
@@ -139,7 +145,7 @@ def test_uninformative_feature_axis_gets_little_weight() -> None:
     def vectors(count: int, second: float) -> np.ndarray:
         return np.stack([rng.normal(0, 1, count), rng.normal(second, 0.1, count)], axis=1).astype(np.float32)
 
-    shown = [Shown(vectors(8, 1.0), vectors(60, 0.0), *NO_OUTLINE) for _ in range(5)]
+    shown = [ImageExamples(vectors(8, 1.0), vectors(60, 0.0), *NO_OUTLINE) for _ in range(5)]
     found = learn("thing", shown, "", ())
     assert abs(found.direction[1]) > 3 * abs(found.direction[0])
     assert (found.probability(vectors(50, 1.0)) > 0.5).mean() > 0.9
@@ -160,7 +166,7 @@ def test_objects_at_the_edge_and_images_without_one_are_learned_from(box: tuple[
 
 def test_no_example_is_an_error() -> None:
     with pytest.raises(LearnedObjectError, match="no image shows mug"):
-        learn("mug", [Shown(np.zeros((0, 3), np.float32), np.ones((4, 3), np.float32), *NO_OUTLINE)], "", ())
+        learn("mug", [ImageExamples(np.zeros((0, 3), np.float32), np.ones((4, 3), np.float32), *NO_OUTLINE)], "", ())
 
 
 def test_boxes_are_drawn_to_the_outline_that_their_vectors_tell() -> None:
@@ -168,7 +174,7 @@ def test_boxes_are_drawn_to_the_outline_that_their_vectors_tell() -> None:
     rng = np.random.default_rng(1)
     changes = rng.uniform(-0.3, 0.3, (200, 4)).astype(np.float32)
     told = (10 * changes + rng.normal(0, 0.05, changes.shape)).astype(np.float32)
-    found = learn("thing", [Shown(told[:20], -told[20:60] + 9, told, changes)], "", ())
+    found = learn("thing", [ImageExamples(told[:20], -told[20:60] + 9, told, changes)], "", ())
     size, change = np.array([40.0, 20.0], np.float32), np.array([0.2, -0.1, 0.15, -0.2], np.float32)
     (drawn,) = found.drawn(np.array([[0, 0, *size]], np.float32), 10 * change[None])
     np.testing.assert_allclose((drawn[:2] + drawn[2:]) / 2, size * (0.5 + change[:2]), atol=0.5)

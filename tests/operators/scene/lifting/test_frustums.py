@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from operators.scene.lifting.frustums import _DENSE, LiftSettings, Seen, _divided, _image, _linked, lift
+from operators.scene.lifting.frustums import _DENSE, LiftSettings, ProjectedCloud, _divided, _image, _linked, lift
 
 REACH = 0.1
 
@@ -30,7 +30,9 @@ def test_a_chain_is_one_group_whatever_its_order() -> None:
 @pytest.mark.parametrize(("count", "cut"), [(60, 0), (99, 0), (250, 2)])
 def test_one_in_a_hundred_pixels_may_stray_from_the_image_of_a_thing(count: int, cut: int) -> None:
     u, v = np.random.default_rng(count).uniform(0, 100, (2, count))
-    seen = Seen(np.zeros((count, 3)), np.stack([u, v], axis=1), np.ones(count, bool), np.array([0, 0, 1.0]), grain=1.5)
+    seen = ProjectedCloud(
+        np.zeros((count, 3)), np.stack([u, v], axis=1), np.ones(count, bool), np.array([0, 0, 1.0]), grain=1.5
+    )
     low, high = np.sort(u)[[cut, -1 - cut]], np.sort(v)[[cut, -1 - cut]]
     assert _image(seen, u, v) == (low[0] - 1.5, high[0] - 1.5, low[1] + 1.5, high[1] + 1.5)
 
@@ -47,13 +49,13 @@ def test_points_in_two_boxes_go_to_the_one_whose_middle_is_nearer_by_its_sides()
     np.testing.assert_array_equal(kept[0], np.setdiff1d(inside[0], second))
 
 
-def behind_slats(slats: int) -> Seen:
+def behind_slats(slats: int) -> ProjectedCloud:
     """A chair's back of slats 2 m away, before a wall at 3 m, which shows between them and around it; f = 500."""
     u, v = (grid.ravel() for grid in np.meshgrid(np.arange(200.0, 440, 4), np.arange(140.0, 340, 4)))
     back = (np.abs(u - 320) <= 50) & (np.abs(v - 240) <= 50)
     depth = np.where(back & ((v - 190) % (100 / slats) < 8), 2.0, 3.0)
     points = np.column_stack([(u - 320) / 500, (v - 240) / 500, np.ones(len(u))]) * depth[:, None]
-    return Seen(points, np.column_stack([u, v]), np.ones(len(u), bool), np.array([0.0, -1, 0]), grain=2.0)
+    return ProjectedCloud(points, np.column_stack([u, v]), np.ones(len(u), bool), np.array([0.0, -1, 0]), grain=2.0)
 
 
 @pytest.mark.parametrize("slats", [4, 5])
@@ -76,7 +78,7 @@ def test_pixel_columns_return_the_points_between_two_places() -> None:
     rng = np.random.default_rng(3)
     u, v = rng.uniform(0, 640, 4000), rng.uniform(0, 480, 4000)
     inside = rng.random(4000) < 0.8
-    seen = Seen(np.zeros((4000, 3)), np.stack([u, v], axis=1), inside, np.array([0, 0, 1.0]))
+    seen = ProjectedCloud(np.zeros((4000, 3)), np.stack([u, v], axis=1), inside, np.array([0, 0, 1.0]))
     for left, right in [(100.3, 231.7), (-50.0, 12.0), (630.0, 900.0), (-9.0, -2.0), (700.0, 800.0)]:
         first, last = seen.columns.between(left, right)
         rows = seen.columns.order[first:last]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from operators.simulator.people.body import varied_body
-from operators.simulator.people.movers import Carried
+from operators.simulator.people.movers import CarriedObject
 from operators.simulator.people.persons import Person
 from operators.simulator.scene import Thing, World
 from operators.simulator.things.furnishing import FLOOR
@@ -100,7 +100,7 @@ def test_hand_reaches_the_grasp_point(name: str, seed: int) -> None:
 @pytest.mark.parametrize("name", OFFICE_AND_LONG)
 def test_carried_object_lies_on_its_table_while_not_held(name: str) -> None:
     here = world(name, 0)
-    for thing in (t for t in here.objects() if isinstance(t.mover, Carried)):
+    for thing in (t for t in here.objects() if isinstance(t.mover, CarriedObject)):
         for t in np.arange(0, 60, 1.3):
             held = any(r.predicate == "holding" and r.object == thing.id for r in here.relations(t))
             lies = [r.object for r in here.relations(t) if r.predicate == "on" and r.subject == thing.id]

@@ -13,7 +13,7 @@ from operators.geometry.se3 import Matrix
 from operators.slam.keyframe_graph import SAVED, Node
 from operators.slam.lidar.graph import LOOKS, LidarGraph, LidarSettings
 from operators.slam.lidar.view import LidarSight, LidarView
-from operators.slam.sensor_model import Added
+from operators.slam.sensor_model import KeyframeResult
 from tests.support.made_scans import at
 
 SMALL = np.diag([1e-4] * 6)
@@ -57,7 +57,7 @@ def test_a_map_is_not_found_where_another_part_of_it_explains_the_scan_as_well(b
     eyes = Corridor(both=both)
     graph = LidarGraph(LidarSettings(), eyes)
     graph.begin_in(nodes)
-    added, looks = list[Added](), [0]
+    added, looks = list[KeyframeResult](), [0]
     for k in range(20):
         added.append(graph.add(100 + k, at(0.06 * k, 0, 0), SMALL, view(50, 0.01), 0, False))
         looks.append(eyes.looks)

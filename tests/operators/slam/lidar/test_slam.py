@@ -24,7 +24,7 @@ from operators.slam.lidar.graph import LidarGraph, LidarSettings
 from operators.slam.lidar.map_file import read_lidar_map
 from operators.slam.lidar.mapper import LidarMapper
 from operators.slam.lidar.view import LidarEyes, LidarView
-from operators.slam.place import Mapped, Place
+from operators.slam.place import MappingResult, Place
 from tests.support.made_scans import HALL, HALL_BOXES, NOTHING, at, drifting, on_round, scan
 
 ROUND = 28  # scans
@@ -135,7 +135,7 @@ def tracked(
     return Tracked(state, "", T, covariance, np.zeros(6), None, none, {}, given)
 
 
-def mapped(poses: Sequence[Matrix], said: Sequence[Matrix], slam: LidarMapper) -> list[Mapped]:
+def mapped(poses: Sequence[Matrix], said: Sequence[Matrix], slam: LidarMapper) -> list[MappingResult]:
     """What becomes of scans from `poses` whose odometry says `said`."""
     grown = np.diag([1e-2**2] * 6)
     return [

@@ -19,7 +19,7 @@ from operators.odometry.rgbd.noise import Noise
 from operators.odometry.rgbd.settings import RgbdOdometryConfig
 from operators.odometry.rgbd.surface import Surface
 from operators.odometry.rgbd.tracker import RgbdOdometry
-from operators.slam.visual.view import STRIDE, Judge, Sight, View, relief, sight
+from operators.slam.visual.view import STRIDE, Judge, View, ViewMatch, relief, sight
 from operators.sources.room import Room, camera_path, look_at
 
 K = np.array([[158.0, 0.0, 95.5], [0.0, 158.0, 71.5], [0.0, 0.0, 1.0]])
@@ -134,7 +134,7 @@ def test_a_view_of_a_room_has_relief() -> None:
 
 def test_doubts_have_reasons() -> None:
     def doubt(inliers: int, overlap: float, agreement: float) -> str:
-        return Judge().doubt(Sight(np.eye(4), np.eye(6), 99, inliers, 50, overlap, agreement))
+        return Judge().doubt(ViewMatch(np.eye(4), np.eye(6), 99, inliers, 50, overlap, agreement))
 
     assert doubt(19, 0.9, 0.9) == "too few features agree"
     assert doubt(99, 0.1, 0.9) == "too little of the depth overlaps"

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 LONGEST_STEP = 0.5
-"""Seconds that count, at most, between two readings: who uses the clock reads it more often while it runs."""
+"""Seconds that count, at most, between two readings: users of the clock read it more often while they run."""
 LOOK_EVERY = 0.2
 """Seconds of a single wait that is timed by such a clock."""
 

@@ -18,7 +18,7 @@ _BITS = 10
 _LAST = (1 << _BITS) - 1
 
 
-class Places:
+class MessageSet:
     """A set of messages of one stream, by their places: a bit for each, since numbers follow each other."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class Places:
             found[incarnation] += bits.bit_count()
         return found
 
-    def beyond(self, others: Places, since: Place | None = None) -> int:
+    def beyond(self, others: MessageSet, since: Place | None = None) -> int:
         """Returns how many of them are not among `others`, all or those from a place on."""
         self._settle()
         others._settle()
@@ -73,7 +73,7 @@ class Places:
         return found
 
 
-class Book:
+class NodeRecordTotals:
     """The records of one node, added up. `begin`: the index from which on there are all; None where none is missing in
     front.
 
@@ -93,7 +93,7 @@ class Book:
         self.replayed = self.finished = False
         self.sent = dict.fromkeys(self._outputs, 0)
         self.digests = {stream: StreamDigest() for stream in self._outputs}
-        self.made = {stream: Places() for stream in self._outputs}
+        self.made = {stream: MessageSet() for stream in self._outputs}
         self.since: dict[str, Emission] = {}
         self.outliner = Outliner(self._outputs)
         self._last = (-1, -1)
@@ -165,14 +165,14 @@ class Book:
             self._follow(record)
 
 
-class Books:
+class GraphRecordTotals:
     """The books of all nodes of a graph, and the messages that any of them took."""
 
     def __init__(self, log: FiringLog, graph: Graph) -> None:
         """Reads all records. Those that cannot be read are an error of the node that they are asked for."""
         self.operators = log.operators
-        self.taken = {stream: Places() for stream in graph.streams}
-        self._books = {name: Book(node, log.begins.get(name)) for name, node in graph.nodes.items()}
+        self.taken = {stream: MessageSet() for stream in graph.streams}
+        self._books = {name: NodeRecordTotals(node, log.begins.get(name)) for name, node in graph.nodes.items()}
         self._errors: dict[str, RecordingError] = {}
         numbers = dict.fromkeys(graph.nodes, 0)
         for name, payload in log.all_batches():
@@ -201,7 +201,7 @@ class Books:
                 if message.stream in self.taken:
                     self.taken[message.stream].add(message.incarnation, message.seq)
 
-    def of(self, name: str) -> Book:
+    def of(self, name: str) -> NodeRecordTotals:
         """The book of a node. Raises `RecordingError` for records that cannot be read."""
         if name in self._errors:
             raise self._errors[name].with_traceback(None)  # each raise adds to it

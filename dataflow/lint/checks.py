@@ -21,7 +21,7 @@ from dataflow.lint.turning import Turning, turning_of
 SIGMAS = 3.0
 """Standard deviations that a clock has to be off by, besides what is tolerated."""
 DRIFTED = 0.005
-"""Seconds that a drift must come to over the recording to be told."""
+"""Seconds that a drift must reach over the recording to be reported."""
 
 
 @dataclass(slots=True)

@@ -34,11 +34,11 @@ LEAVE_WITHIN = 5.0
 """Seconds after which that process is killed."""
 
 
-class Raised(RuntimeError):
+class OperatorRaised(RuntimeError):
     """Raised for what an operator raised in its own process, in words."""
 
 
-class Here:
+class InProcessOperator:
     """An operator whose calls are made in this process. `shell`: itself."""
 
     def __init__(self, node: Node, seed: int, version: int) -> None:
@@ -68,12 +68,12 @@ class Here:
         close_quietly(self._calls.operator)
 
 
-class There:
+class ChildProcessOperator:
     """An operator whose calls are made by a process in its environment. `shell`: another object of its class, which is
     not set up.
 
-    Its methods do what those of `Here` do; what a firing raises is `Raised`. Raises `EnvError`, and `ReplayError` where
-    the process ends or hangs.
+    Its methods do what those of `InProcessOperator` do; what a firing raises is `OperatorRaised`. Raises `EnvError`,
+    and `ReplayError` where the process ends or hangs.
     """
 
     def __init__(self, node: Node, seed: int, version: int, threads: int) -> None:
@@ -118,15 +118,15 @@ class There:
             code = self._process.returncode
             raise ReplayError(f"{self._node.name}: its process in {self._node.env} ended ({code})") from error
         if what == "failed":
-            raise OperatorFailure(self._node.name, found[0], Raised(found[1]))
+            raise OperatorFailure(self._node.name, found[0], OperatorRaised(found[1]))
         if what == "raised":
-            raise Raised(found)
+            raise OperatorRaised(found)
         return found
 
 
 def serve(pipe: Connection) -> None:
     """Makes the calls of one operator, as they are asked for, until the other side closes."""
-    here: Here | None = None
+    here: InProcessOperator | None = None
     while True:
         try:
             name, arguments = pickle.loads(pipe.recv_bytes())
@@ -135,24 +135,24 @@ def serve(pipe: Connection) -> None:
         try:
             if here is None:
                 *made_of, threads = arguments
-                here, found = Here(*made_of), None
+                here, found = InProcessOperator(*made_of), None
                 limit_threads(threads)
             else:
                 found = getattr(here, name)(*arguments)
             answer = "given", found
         except OperatorFailure as error:
             answer = "failed", (error.when, error.summary)
-        except BaseException as error:  # whatever an operator raises is told, as in a run
+        except BaseException as error:  # whatever an operator raises is reported, as in a run
             answer = "raised", readable(error)
         pipe.send_bytes(pickle.dumps(answer, PROTOCOL))
     if here is not None:
         here.close()
 
 
-def operator_of(node: Node, seed: int, version: int, threads: int) -> Here | There:
+def operator_of(node: Node, seed: int, version: int, threads: int) -> InProcessOperator | ChildProcessOperator:
     """Returns an operator that is called in its environment: in this process where that is here. Raises `EnvError`."""
     elsewhere = node.env is not None and not is_environment(node.env)
-    return There(node, seed, version, threads) if elsewhere else Here(node, seed, version)
+    return ChildProcessOperator(node, seed, version, threads) if elsewhere else InProcessOperator(node, seed, version)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def surroundings(call: Callable[..., Any]) -> dict[str, Any]:
 
 
 def texts_around(call: Callable[..., Any]) -> set[str]:
-    """Returns the places of those that are texts, or hold nothing but texts: what a service may be told by them."""
+    """Returns the places of those that are texts, or hold nothing but texts: what they may pass to a service."""
     return {place for place, value in surroundings(call).items() if _is_text(value) and value}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import dataflow.messages as messages
-from dataflow.interop.ros.made import (
+from dataflow.interop.ros.construction import (
     as_bytes,
     header_of,
     make,

@@ -12,7 +12,7 @@ ELSEWHERE = frozenset({"stamp", "seq", "is_dense", "angle_max", "row_step", "str
 """Fields whose content follows from what is carried: times are the stamp's, `seq` is of ROS 1's transport."""
 
 
-class Seen:
+class TrackedMessage:
     """A message of ROS whose fields are read as usual, and which keeps account of what was read.
 
     Messages that it holds are of this class too. `losses`: what a conversion has said with `lose`.
@@ -46,17 +46,17 @@ class Seen:
                     yield from _named(value, place, frame)
                 continue
             child = self._children[name]
-            if isinstance(child, Seen):
+            if isinstance(child, TrackedMessage):
                 yield from child._unread(place, frame)
             elif isinstance(child, list):
                 for one in child:
-                    if isinstance(one, Seen):
+                    if isinstance(one, TrackedMessage):
                         yield from one._unread(f"{place}[]", frame)
 
 
 def lose(message: Any, what: str) -> None:
-    """Notes that a conversion keeps less than a message holds, if the message is a `Seen`, which collects losses."""
-    if isinstance(message, Seen):
+    """Notes that a conversion keeps less than a message holds, if the message is a `TrackedMessage`."""
+    if isinstance(message, TrackedMessage):
         message.losses.append(what)
 
 
@@ -68,13 +68,13 @@ def _names(value: Any) -> list[str]:
 def _wrapped(value: Any, losses: list[str]) -> Any:
     if isinstance(value, list):
         return [_wrapped(one, losses) for one in value]
-    return Seen(value, losses) if hasattr(value, "__dataclass_fields__") else value
+    return TrackedMessage(value, losses) if hasattr(value, "__dataclass_fields__") else value
 
 
 def _named(value: Any, place: str, frame: str | None) -> Iterator[str]:
     """The fields of a message that hold something; the field itself where it is a value."""
     if hasattr(value, "__dataclass_fields__"):
-        yield from Seen(value)._unread(place, frame)
+        yield from TrackedMessage(value)._unread(place, frame)
     else:
         yield place
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from dataflow.blame.again import Slot
 from dataflow.blame.line import Call
 from dataflow.blame.links import Way
 from dataflow.blame.nudge import groups, is_finite, made_finite, nudged
+from dataflow.blame.repeated_calls import Slot
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
@@ -19,7 +19,7 @@ ANOTHER = 8
 effect: a number on the same side of a threshold, nudged, shows none."""
 
 
-class Taken(NamedTuple):
+class TakenMessage(NamedTuple):
     """A message that a call took in an input."""
 
     call: Call
@@ -27,7 +27,7 @@ class Taken(NamedTuple):
     entry: Entry
 
 
-class Others:
+class SubstituteMessages:
     """Finds other messages of a recording. `taken` gives the messages of a stream in an input of calls before one."""
 
     def __init__(self, recording: Recording, taken: Callable[[Call, str, str], list[Message]]) -> None:
@@ -35,7 +35,7 @@ class Others:
         self._spread: dict[str, list[Message]] = {}
         """Of recorded streams, some messages of the whole length."""
 
-    def instead(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
+    def instead(self, taken: Sequence[TakenMessage], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
         """Yields other messages in place of some, where one is another indeed: nudged to either side, what is measured
         first; made finite and nudged, where some are not; the one before each, or with `hold` the one before the first
         of its stream, since a spike that lasts would only be put off."""
@@ -43,7 +43,7 @@ class Others:
             if any(message != each.entry.value for message, each in zip(messages, taken, strict=True)):
                 yield way, messages
 
-    def _alternatives(self, taken: Sequence[Taken], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
+    def _alternatives(self, taken: Sequence[TakenMessage], *, hold: bool) -> Iterator[tuple[Way, Sequence[Message]]]:
         values = [each.entry.value for each in taken]
         grouped = [self.groups(each) for each in taken]
         for k in range(max(map(len, grouped), default=0)):
@@ -66,11 +66,11 @@ class Others:
             others.append(entry.value if other is None else other.replace(stamp=entry.stamp))
         yield "the one before", others
 
-    def groups(self, taken: Taken) -> list[tuple[str, ...]]:
+    def groups(self, taken: TakenMessage) -> list[tuple[str, ...]]:
         """Returns the fields of a message that are nudged, in their order."""
         return groups(taken.entry.value, self._before(*taken))
 
-    def _finite(self, taken: Taken) -> Message:
+    def _finite(self, taken: TakenMessage) -> Message:
         """A message with finite neighbours in place of infinities, if there are any; else itself."""
         value: Message = taken.entry.value
         earlier = self._before(*taken)
