@@ -290,7 +290,7 @@ def _arrivals(graph: Graph, faults: Faults, emitter: Any, played: Recording | No
     found: list[tuple[int, str, Entry]] = []
     latest = dict.fromkeys(node.outputs, NEVER)
     last = STAMP
-    static, steps = ({}, node.make().stream()) if played is None else _played(played, node)
+    static, steps = ({}, node.make().stream()) if played is None else _played(played, node)  # type: ignore[attr-defined]
     outputs = [_sent(static.get(port), stream, 0) for port, stream in node.outputs.items()]
     log.add("setup", NEVER + 1, 0, outputs=_emissions(outputs), detail={"params": dict(node.params)})
     for entry in filter(None, outputs):

@@ -55,7 +55,7 @@ class Witness(FlightSink):
     def __init__(
         self, flown: Flown, folder: Path, graph: Graph, streams: list[str], options: Mapping[str, Any]
     ) -> None:
-        flown.__init__()  # of the recorder before it nothing is known
+        flown.__init__()  # type: ignore[misc]  # of the recorder before it nothing is known
         self._flown = flown
         super().__init__(folder, graph, streams, options)
 
@@ -66,7 +66,7 @@ class Witness(FlightSink):
             flown.clock = max(flown.clock, message.stamp)
             flown.given.append(((stream, incarnation, seq), message.stamp))
         if stream == f"{self.graph.namespace}/{STREAM}":
-            low = float(message.vectors[0, 0]) < BELOW
+            low = float(message.vectors[0, 0]) < BELOW  # type: ignore[attr-defined]
             if flown.begins(stream, low):
                 flown.asked.append((("field", stream, message.stamp), flown.clock))
 

@@ -230,7 +230,7 @@ class Pair(Counter):
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for step in super().stream():
-            k = int(number(step["fast"]))
+            k = int(number(step["fast"]))  # type: ignore[arg-type]
             yield {"fast": step["fast"]} if k % 2 else {"slow": step["fast"]}
 
 
@@ -240,7 +240,7 @@ class JumpingPair(Device):
     def stream(self) -> Iterator[Mapping[str, Message]]:
         for step in super().stream():
             message = step["fast"]
-            k = int(number(message))
+            k = int(number(message))  # type: ignore[arg-type]
             message = message if k < self.count // 2 else message.replace(stamp=message.stamp - 300_000_000)
             yield {"fast": message} if k % 2 else {"slow": message}
 

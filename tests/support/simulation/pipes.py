@@ -200,7 +200,7 @@ def travel(journey: Journey) -> None:
 
     def begin(k: int) -> None:
         mine, theirs = "ab"[k], "ba"[k]
-        pipes.append(Pipe(link, theirs, mine, taken[k].append, bounded=journey.bounded))
+        pipes.append(Pipe(link, theirs, mine, taken[k].append, bounded=journey.bounded))  # type: ignore[arg-type]
         world.start("link", processes[1 - k], lambda: link.load(link.ways[mine]))
         world.start("link", processes[k], lambda: link.deliver(link.ways[mine]))
 
@@ -208,9 +208,9 @@ def travel(journey: Journey) -> None:
         stack.enter_context(bound(_bindings(world) | SMALL))
         stack.callback(world.close)
         for k in range(2):
-            world.start("begin", processes[k], lambda k=k: begin(k))
-            world.run(lambda k=k: len(pipes) > k, 10.0)
-            world.start("main", processes[k], lambda k=k: _say(world, pipes[k], journey.sent[k]))
+            world.start("begin", processes[k], lambda k=k: begin(k))  # type: ignore[misc]
+            world.run(lambda k=k: len(pipes) > k, 10.0)  # type: ignore[misc]
+            world.start("main", processes[k], lambda k=k: _say(world, pipes[k], journey.sent[k]))  # type: ignore[misc]
         for event in journey.events:
             world.at(world.now + event.at, functools.partial(link.happen, event))
         last = max([event.at + event.span for event in journey.events], default=0.0)

@@ -96,7 +96,7 @@ def _smaller(scenario: Scenario) -> Iterator[Scenario]:
         yield replace(scenario, parts=fewer)
     for name, value in (("rate", None), ("work", 0.0), ("reading", 0.0), ("window", 256)):
         if getattr(scenario, name) != value:
-            yield replace(scenario, **{name: value})
+            yield replace(scenario, **{name: value})  # type: ignore[arg-type]
     if not scenario.happenings and not scenario.faults and scenario.graph != "chain":
         yield replace(scenario, graph="chain", parts=())
     for count in (2, 4, scenario.count // 2, scenario.count - 1):

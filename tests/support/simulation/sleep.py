@@ -24,8 +24,8 @@ def watched(world: World) -> Iterator[None]:
                     world.violation = Violation(f"{runner.node.name} sleeps though its firing at {stamp} is decided")
         return worked
 
-    Ready.step = step
+    Ready.step = step  # type: ignore[method-assign]
     try:
         yield
     finally:
-        Ready.step = right
+        Ready.step = right  # type: ignore[method-assign]

@@ -98,9 +98,9 @@ class LateBatch(Operator):
 class EveryTenth(LateBatch, every="100ms"):
     """Raises: a batch of more than some messages."""
 
-    x: Batch[FeatureVector]
+    x: Batch[FeatureVector]  # type: ignore[assignment]
 
-    def process(self, x: tuple[FeatureVector, ...], rare: tuple[FeatureVector, ...]) -> FeatureVector:
+    def process(self, x: tuple[FeatureVector, ...], rare: tuple[FeatureVector, ...]) -> FeatureVector:  # type: ignore[override]
         if not fixed() and any(each.vectors[0, 0] == 444 for each in x):
             raise IndexError("no room")
         return vector(x[-1].stamp if x else STAMP, len(rare))

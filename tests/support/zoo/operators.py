@@ -170,7 +170,7 @@ class LazyLibrary(Hard):
         import cv2
 
         found = np.zeros((1, 4), np.float32)
-        cv2.randu(found, 0, 1)
+        cv2.randu(found, 0, 1)  # type: ignore[call-overload]
         return found[0]
 
 
@@ -340,7 +340,7 @@ class OwnGenerator(Hard):
 class Sometimes(Hard):
     """Emits by chance."""
 
-    def process(self, x: FeatureVector) -> FeatureVector | None:
+    def process(self, x: FeatureVector) -> FeatureVector | None:  # type: ignore[override]
         return super().process(x) if os.urandom(1)[0] & 1 else None
 
 
