@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -36,7 +37,7 @@ class OpenedFile(Protocol):
 File = TypeVar("File", bound=OpenedFile)
 
 
-class JoinedBag(Generic[File]):
+class JoinedBag(ABC, Generic[File]):
     """Files whose topics belong together, as one bag. A subclass opens a file, and reads its channels and messages.
 
     `closing`: what else ends when the bag is closed.
@@ -66,17 +67,17 @@ class JoinedBag(Generic[File]):
         self.kind += f", {len(files)} files" if len(files) > 1 else ""
         self.notes: tuple[str, ...] = (*notes, *unusual)
 
+    @abstractmethod
     def _opened(self, file: Path, notes: list[str]) -> File:
         """Opens a file, and adds to `notes` what is unusual about it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _channels(self, file: File) -> Iterator[tuple[int, Topic]]:
         """The channels of a file by number, each as a topic."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _rows(self, number: int, names: Mapping[int, str], broken: Counter[str]) -> Iterator[Row]:
         """The messages of some channels of a file by log time; equal ones as they were written."""
-        raise NotImplementedError
 
     def messages(self, topics: Collection[str]) -> Iterator[Stored]:
         """Every message of some topics, in the order of log times; equal ones as they were written. Those that damage
@@ -136,9 +137,9 @@ class SalvagedBag(JoinedBag[IntactFile | DamagedFile]):
 
     _wreck: ClassVar[type[DamagedFile]]
 
+    @abstractmethod
     def _sound(self, file: Path, notes: list[str]) -> IntactFile:
         """Opens a sound file, and adds to `notes` what is unusual about it. Raises `BrokenFileError`."""
-        raise NotImplementedError
 
     def _opened(self, file: Path, notes: list[str]) -> IntactFile | DamagedFile:
         try:
