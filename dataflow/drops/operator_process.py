@@ -35,7 +35,14 @@ LEAVE_WITHIN = 5.0
 
 
 class OperatorRaised(RuntimeError):
-    """Raised for what an operator raised in its own process, in words."""
+    """Raised for what an operator raised in its own process: by the name of that error, with its text."""
+
+    @classmethod
+    def as_read(cls, words: str) -> OperatorRaised:
+        """The error that `readable` put into words, which gives the same words of this one."""
+        name, _, text = words.partition(": ")
+        kind: type[OperatorRaised] = type(name, (cls,), {})
+        return kind(text) if text else kind()
 
 
 class InProcessOperator:
@@ -118,9 +125,9 @@ class ChildProcessOperator:
             code = self._process.returncode
             raise ReplayError(f"{self._node.name}: its process in {self._node.env} ended ({code})") from error
         if what == "failed":
-            raise OperatorFailure(self._node.name, found[0], OperatorRaised(found[1]))
+            raise OperatorFailure(self._node.name, found[0], OperatorRaised.as_read(found[1]))
         if what == "raised":
-            raise OperatorRaised(found)
+            raise OperatorRaised.as_read(found)
         return found
 
 
